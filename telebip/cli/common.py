@@ -1,0 +1,72 @@
+"""What the commands share: one-line errors, devices."""
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, NoReturn
+
+from telebip.errors import UserError, nearest
+
+if TYPE_CHECKING:
+    import torch
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser whose errors are one line that names the nearest valid option."""
+
+    def __init__(self, description: str, examples: str) -> None:
+        """Create a parser; `examples` closes the `--help` text."""
+        super().__init__(
+            description=description,
+            epilog=f"examples:\n{examples}",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            allow_abbrev=False,
+        )
+
+    def parse(self, argv: Sequence[str] | None) -> argparse.Namespace:
+        """Parse options and positional arguments in any order."""
+        options, unknown = self.parse_known_intermixed_args(argv)
+        if unknown:
+            known = [option for action in self._actions for option in action.option_strings]
+            self.error(f"unknown option '{unknown[0]}'; {nearest(unknown[0], known)}")
+        return options
+
+    def error(self, message: str) -> NoReturn:
+        """Report wrong usage like every other mistake."""
+        raise UserError(f"{message} (see {os.path.basename(sys.argv[0])} --help)")
+
+
+def run(command: Callable[[], None]) -> NoReturn:
+    """Run a command: exit status 0, 2 after one line on standard error for a `UserError`, 130 when interrupted."""
+    try:
+        command()
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        sys.exit(130)
+    except BrokenPipeError:  # the reader of our output has gone, as in `... | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    sys.exit(0)
+
+
+def resolve_device(name: str) -> "torch.device":
+    """Return the torch device that `auto`, `cpu`, `cuda` or `cuda:N` means on this machine; `auto` prefers CUDA.
+
+    Raises:
+        UserError: the name is none of these, or the device is not there.
+    """
+    import torch
+
+    available = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
+    if name == "auto":
+        name = available[-1] if len(available) == 1 else available[1]
+    elif name == "cuda":
+        name = "cuda:0"
+    elif name != "cpu" and not (name.startswith("cuda:") and name[5:].isdigit()):
+        raise UserError(f"unknown device '{name}'; valid: auto, cpu, cuda, cuda:N")
+    if name not in available:
+        raise UserError(f"device '{name}' is not there; this machine has: {', '.join(available)}")
+    return torch.device(name)

@@ -1,0 +1,160 @@
+"""`train.py`: train a policy."""
+
+import argparse
+import signal
+from collections.abc import Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from telebip.cli.common import Parser, resolve_device
+from telebip.config import TaskConfig, load_task, task_names
+from telebip.errors import UserError
+
+EXAMPLES = """\
+  train.py --task telebip_flat
+  train.py --task telebip_fast --num-envs 2048 --max-iterations 500 ppo.num_steps_per_env=24
+  train.py --resume runs/telebip_flat/2026-01-31_12-00-00 --max-iterations 400
+  tensorboard --logdir runs
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Parse arguments and train."""
+    options = _parse(argv)
+    overrides = [
+        f"{key}={value}"
+        for key, value in (
+            ("num_envs", options.num_envs),
+            ("ppo.max_iterations", options.max_iterations),
+            ("seed", options.seed),
+        )
+        if value is not None
+    ] + options.overrides
+
+    if options.resume:
+        from telebip.rl.checkpoint import load_checkpoint
+
+        checkpoint = load_checkpoint(options.resume)
+        if options.task and options.task != checkpoint.task:
+            raise UserError(f"checkpoint '{checkpoint.path}' is of task '{checkpoint.task}', not of '{options.task}'")
+        if "optimizer_state_dict" not in checkpoint.learner:
+            raise UserError(f"checkpoint '{checkpoint.path}' holds the policy alone; resume from a model_<iteration>.pt")
+        task, config, run_dir = checkpoint.task, load_task(checkpoint.config, overrides), checkpoint.path.parent
+    elif options.task:
+        checkpoint, run_dir = None, None
+        task, config = Path(options.task).stem, load_task(options.task, overrides)
+    else:
+        raise UserError(f"which task? --task {{{','.join(task_names())}}}, or --resume a run")
+    _train(options, task, config, run_dir, checkpoint)
+
+
+def _train(options: argparse.Namespace, task: str, config: TaskConfig, run_dir: Path | None, checkpoint) -> None:
+    from rich.console import Console
+
+    console = Console(highlight=False)
+    with console.status("loading torch and the physics engine"):
+        from telebip.env import TelebipEnv
+        from telebip.rl.run import create_run_dir, describe_run
+        from telebip.rl.train import Progress, Trainer
+        from telebip.robot import load_robot
+
+    device = resolve_device(options.device)
+    robot = load_robot(config.sim.robot)
+    with console.status("creating the worlds (the warp backend compiles for a minute or two the first time)"):
+        env = TelebipEnv(config, robot, device, options.backend)
+        run_dir = run_dir or create_run_dir(Path(options.log_dir), task)
+        trainer = Trainer(env, task, run_dir)
+    if checkpoint:
+        trainer.resume(checkpoint)
+    total = config.ppo.max_iterations
+    if trainer.iteration >= total:
+        console.print(f"{run_dir} has finished its {total} iterations; raise --max-iterations to train on")
+        return
+    describe_run(run_dir, config, str(device), type(env.sim).__name__)
+    backend = type(env.sim).__name__.removesuffix("Simulator").lower()
+    console.print(f"{task}: {config.num_envs} worlds on {device} ({backend}), writing to {run_dir}")
+    if trainer.iteration:
+        console.print(f"resuming after iteration {trainer.iteration} of {total}")
+
+    with _stop_on_signal(console) as stop, _progress_bar(console, total, trainer.iteration) as bar:
+
+        def report(progress: Progress) -> None:
+            bar(progress, env.max_episode_length)
+
+        trainer.learn(stop, report)
+    finished = trainer.iteration >= total
+    if not finished:
+        console.print(f"stopped after iteration {trainer.iteration} of {total}; go on with: train.py --resume {run_dir}")
+    console.print(f"see it walk: python scripts/play.py --checkpoint {run_dir}")
+
+
+def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = Parser("Train a walking policy with PPO in thousands of parallel worlds.", EXAMPLES)
+    parser.add_argument("--task", metavar="NAME", help=f"{', '.join(task_names())}, or a path to a YAML file")
+    parser.add_argument("--num-envs", metavar="N", help="worlds in parallel (default: the task's num_envs)")
+    parser.add_argument("--max-iterations", metavar="N", help="total of the run (default: the task's ppo.max_iterations)")
+    parser.add_argument("--seed", metavar="S", help="of worlds and networks (default: the task's seed)")
+    parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto, which prefers CUDA)")
+    parser.add_argument(
+        "--backend",
+        default="auto",
+        choices=("auto", "native", "warp"),
+        help="physics engine: native is C MuJoCo on the CPU, warp is MuJoCo Warp (default: auto, warp on CUDA, else native)",
+    )
+    parser.add_argument("--log-dir", metavar="DIR", default="runs", help="the run writes to DIR/<task>/<time> (default: runs)")
+    parser.add_argument(
+        "--resume",
+        metavar="RUN_OR_CHECKPOINT",
+        help="go on with a run, in its folder and with its configuration, up to --max-iterations in all",
+    )
+    parser.add_argument("overrides", nargs="*", metavar="key.path=value", help="override any field of the task")
+    return parser.parse(argv)
+
+
+@contextmanager
+def _stop_on_signal(console):
+    """Yield a function that tells whether the user asked to stop: once finishes the iteration and saves, twice leaves at once."""
+    asked = False
+
+    def handle(signum: int, frame: object) -> None:
+        nonlocal asked
+        if asked:
+            raise KeyboardInterrupt
+        asked = True
+        console.print("stopping after this iteration with a checkpoint (press Ctrl-C again to leave at once)")
+
+    previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: asked
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _progress_bar(console, total: int, done: int):
+    """Yield a function that shows a `Progress`: a live bar on a terminal, else one line per twentieth of the run."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    columns = (
+        MofNCompleteColumn(),
+        BarColumn(bar_width=24),
+        TimeElapsedColumn(),
+        TextColumn("eta"),
+        TimeRemainingColumn(),
+        TextColumn("{task.description}"),
+    )
+    every = max(1, total // 50)
+    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+        task = progress.add_task("starting", total=total, completed=done)
+
+        def show(p, max_length: int) -> None:
+            text = (
+                f"{p.samples / 1e6:.2f} M samples at {p.samples_per_s / 1e3:.1f} k/s | return {p.reward:.1f} | "
+                f"length {p.episode_length:.0f}/{max_length} | error {p.lin_vel_error:.2f} m/s | {p.falls_per_minute:.1f} falls/min"
+            )
+            progress.update(task, completed=p.iteration, description=text)
+            if not console.is_terminal and (p.iteration % every == 0 or p.iteration == total):
+                console.print(f"{p.iteration:5d}/{total}  {text}", soft_wrap=True)
+
+        yield show

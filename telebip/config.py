@@ -1,0 +1,368 @@
+"""Typed task configuration: YAML file (and its base) -> command-line overrides -> one validated `TaskConfig`.
+
+The dataclasses below name every field, its type, its unit and its bounds; they hold no numbers, which stand in `configs/`.
+Whatever a user gets wrong is a `UserError` that names the field, the file and line (or the override) and what would be valid.
+"""
+
+import dataclasses
+import math
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from telebip import ROOT
+from telebip.errors import UserError, nearest
+
+CONFIGS = ROOT / "configs"
+
+
+def quantity(unit: str = "", **bounds: float) -> Any:
+    """Declare a required number with its unit and bounds (`gt`, `ge`, `lt`, `le`), which hold for every entry of a tuple."""
+    return field(default=MISSING, metadata={"unit": unit, "bounds": bounds})
+
+
+def section(schema: type) -> Any:
+    """Declare a nested section."""
+    return field(default_factory=schema)
+
+
+@dataclass
+class SimConfig:
+    robot: str = MISSING
+    decimation: int = quantity(ge=1, le=1000)
+
+
+@dataclass
+class EpisodeConfig:
+    length: float = quantity("s", gt=0)
+    min_hip_height: float = quantity("m", ge=0)
+    reset_joint_pos: float = quantity(ge=0)
+    reset_joint_vel: float = quantity(ge=0)
+    reset_lin_vel: float = quantity("m/s", ge=0)
+    reset_ang_vel: float = quantity("rad/s", ge=0)
+    reset_heading: float = quantity("rad", ge=0)
+
+
+@dataclass
+class ActionConfig:
+    hip_roll: float = quantity("rad", gt=0)
+    hip_pitch: float = quantity("rad", gt=0)
+    knee: float = quantity("m", gt=0)
+
+
+@dataclass
+class CommandConfig:
+    lin_vel_x: tuple[float, float] = quantity("m/s")
+    lin_vel_y: tuple[float, float] = quantity("m/s")
+    ang_vel_z: tuple[float, float] = quantity("rad/s")
+    resampling_time: float = quantity("s", gt=0)
+    heading_gain: float = quantity("1/s", ge=0)
+    heading_limit: float = quantity("rad/s", ge=0)
+
+
+@dataclass
+class GaitConfig:
+    period: float = quantity("s", gt=0)
+
+
+@dataclass
+class CmdRewardConfig:
+    k_xy: float = quantity()
+    sigma_xy: float = quantity("m/s", gt=0)
+    k_w: float = quantity()
+    sigma_w: float = quantity("rad/s", gt=0)
+
+
+@dataclass
+class DiffRewardConfig:
+    k_diff: float = quantity(le=0)
+
+
+@dataclass
+class TqRewardConfig:
+    k_tq: float = quantity(le=0)
+
+
+@dataclass
+class FootRewardConfig:
+    k_foot: float = quantity()
+    gamma: float = quantity(gt=0, le=1)
+    first: Literal["newest", "oldest"] = MISSING
+
+
+@dataclass
+class TerminationRewardConfig:
+    k_termination: float = quantity(le=0)
+
+
+@dataclass
+class RewardConfig:
+    cmd: CmdRewardConfig = section(CmdRewardConfig)
+    diff: DiffRewardConfig = section(DiffRewardConfig)
+    tq: TqRewardConfig = section(TqRewardConfig)
+    foot: FootRewardConfig = section(FootRewardConfig)
+    termination: TerminationRewardConfig = section(TerminationRewardConfig)
+
+
+@dataclass
+class PushConfig:
+    enabled: bool = MISSING
+    force: float = quantity("N", ge=0)
+    duration: float = quantity("s", gt=0)
+    interval: tuple[float, float] = quantity("s", gt=0)
+
+
+@dataclass
+class FrictionConfig:
+    enabled: bool = MISSING
+    range: tuple[float, float] = quantity(gt=0)
+
+
+@dataclass
+class NoiseConfig:
+    enabled: bool = MISSING
+    joint_pos: float = quantity(ge=0)
+    joint_vel: float = quantity(ge=0)
+    base_lin_vel: float = quantity("m/s", ge=0)
+    base_ang_vel: float = quantity("rad/s", ge=0)
+    base_quat: float = quantity(ge=0)
+
+
+@dataclass
+class DisturbanceConfig:
+    push: PushConfig = section(PushConfig)
+    friction: FrictionConfig = section(FrictionConfig)
+    noise: NoiseConfig = section(NoiseConfig)
+
+
+@dataclass
+class PpoConfig:
+    max_iterations: int = quantity(ge=1)
+    num_steps_per_env: int = quantity(ge=1)
+    num_learning_epochs: int = quantity(ge=1)
+    num_mini_batches: int = quantity(ge=1)
+    learning_rate: float = quantity(gt=0, le=1)
+    schedule: Literal["fixed", "adaptive"] = MISSING
+    desired_kl: float = quantity(gt=0)
+    gamma: float = quantity(ge=0, le=1)
+    lam: float = quantity(ge=0, le=1)
+    clip_param: float = quantity(gt=0)
+    value_loss_coef: float = quantity(ge=0)
+    entropy_coef: float = quantity(ge=0)
+    max_grad_norm: float = quantity(gt=0)
+    hidden_dims: list[int] = quantity(ge=1)
+    activation: Literal["elu", "relu", "selu", "tanh"] = MISSING
+    obs_normalization: bool = MISSING
+    init_std: float = quantity(gt=0)
+    min_std: float = quantity(gt=0)
+    use_mixed_precision: bool = MISSING
+    save_interval: int = quantity(ge=1)
+
+
+@dataclass
+class TaskConfig:
+    """One task: the MDP and its training. Read `configs/telebip_flat.yaml` for values and explanations."""
+
+    seed: int = quantity(ge=0, le=2**32 - 1)
+    num_envs: int = quantity(ge=1, le=2**24)
+    sim: SimConfig = section(SimConfig)
+    episode: EpisodeConfig = section(EpisodeConfig)
+    action: ActionConfig = section(ActionConfig)
+    command: CommandConfig = section(CommandConfig)
+    gait: GaitConfig = section(GaitConfig)
+    reward: RewardConfig = section(RewardConfig)
+    disturbance: DisturbanceConfig = section(DisturbanceConfig)
+    ppo: PpoConfig = section(PpoConfig)
+
+
+def load_task(task: str | TaskConfig, overrides: Sequence[str] = ()) -> TaskConfig:
+    """Read a task by name or by path to a YAML file (or take a loaded one), apply `key.path=value` overrides, and validate it.
+
+    Raises:
+        UserError: unknown task, unreadable file, unknown or missing field, wrong type or a value out of bounds.
+    """
+    origins: dict[str, str] = {}
+    if isinstance(task, TaskConfig):
+        config, task = OmegaConf.structured(task), "configuration"
+    else:
+        config = OmegaConf.structured(TaskConfig)
+        for path in reversed(_with_bases(_task_path(task))):
+            _apply(config, _read_yaml(path), origins)
+    for override in overrides:
+        key, equals, value = override.partition("=")
+        if not equals or not re.fullmatch(r"\w+(\.\w+)*", key):
+            raise UserError(f"override '{override}' is not of the form key.path=value")
+        try:
+            parsed = OmegaConf.to_container(OmegaConf.from_dotlist([f"value={value}"]), resolve=True)["value"]  # type: ignore[index]
+        except (OmegaConfBaseException, yaml.YAMLError) as error:
+            raise UserError(f"override '{override}': {_one_line(error)}") from error
+        _apply(config, [(key, parsed, f"override '{override}'")], origins)
+    return _validate(config, origins, task)
+
+
+def parse_config(text: str, source: str) -> TaskConfig:
+    """Rebuild a resolved configuration from `to_yaml`'s text, as checkpoints and run folders hold it; `source` names it in errors."""
+    config, origins = OmegaConf.structured(TaskConfig), {}
+    _apply(config, _parse_yaml(text, source), origins)
+    return _validate(config, origins, source)
+
+
+def to_yaml(config: TaskConfig) -> str:
+    """Return the whole configuration as YAML text, complete without a base."""
+    return OmegaConf.to_yaml(OmegaConf.structured(config))
+
+
+def task_names() -> list[str]:
+    """Return the names that `--task` accepts."""
+    return sorted(path.stem for path in CONFIGS.glob("*.yaml"))
+
+
+def _task_path(task: str) -> Path:
+    path = Path(task) if task.endswith((".yaml", ".yml")) else CONFIGS / f"{task}.yaml"
+    if path.is_file():
+        return path
+    if path.suffix and path.parent != CONFIGS:
+        raise UserError(f"task file '{task}' does not exist")
+    raise UserError(f"unknown task '{task}'; {nearest(task, task_names())}")
+
+
+def _with_bases(path: Path) -> list[Path]:
+    """Return `path` and the files it builds on, itself first."""
+    paths = [path]
+    while base := _base_of(paths[-1]):
+        paths.append(_task_path(base))
+        if paths[-1] in paths[:-1]:
+            raise UserError(f"{_shown(path)}: base '{base}' leads back to itself")
+    return paths
+
+
+def _base_of(path: Path) -> str | None:
+    for key, value, where in _read_yaml(path, keep_base=True):
+        if key == "base":
+            if not isinstance(value, str):
+                raise UserError(f"{where}: base must be a task's name")
+            return value
+    return None
+
+
+def _read_yaml(path: Path, keep_base: bool = False) -> list[tuple[str, Any, str]]:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"{_shown(path)}: {_one_line(error)}") from error
+    return [leaf for leaf in _parse_yaml(text, _shown(path)) if keep_base or leaf[0] != "base"]
+
+
+def _parse_yaml(text: str, source: str) -> list[tuple[str, Any, str]]:
+    """Return the leaves of a YAML mapping as (dotted key, value, "file:line")."""
+    try:
+        tree = yaml.compose(text, Loader=yaml.SafeLoader)
+        values = OmegaConf.to_container(OmegaConf.create(text), resolve=True) if tree else {}
+    except (yaml.YAMLError, OmegaConfBaseException, RecursionError, ValueError) as error:
+        raise UserError(f"{source}: not valid YAML: {_one_line(error)}") from error
+    if not isinstance(values, dict):
+        raise UserError(f"{source}: a task is a mapping of fields to values")
+    return list(_leaves(tree, values, source)) if tree else []
+
+
+def _leaves(node: Any, values: Any, source: str, prefix: str = "") -> Iterator[tuple[str, Any, str]]:
+    for key_node, value_node in node.value:
+        key, where = str(key_node.value), f"{source}:{key_node.start_mark.line + 1}"
+        value = values.get(key) if isinstance(values, dict) else None
+        if isinstance(value, dict) and value and isinstance(value_node, yaml.MappingNode):
+            yield from _leaves(value_node, value, source, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value, where
+
+
+def _apply(config: DictConfig, leaves: list[tuple[str, Any, str]], origins: dict[str, str]) -> None:
+    """Set the leaves one by one, so that an error knows its place; remember where each came from."""
+    for key, value, where in leaves:
+        schema = _schema_of(key, where)
+        if dataclasses.is_dataclass(schema):
+            raise UserError(f"{where}: {key} is a section; set one of its fields: {', '.join(f.name for f in dataclasses.fields(schema))}")
+        try:
+            OmegaConf.update(config, key, value)
+        except (OmegaConfBaseException, OverflowError, ValueError, TypeError) as error:
+            raise UserError(f"{where}: {key}: {_describe(value)} is not {_type_name(schema)}") from error
+        origins[key] = where
+
+
+def _schema_of(key: str, where: str) -> Any:
+    """Return the type of a dotted key, or raise the error that names the nearest valid one."""
+    schema: Any = TaskConfig
+    walked = ""
+    for name in key.split("."):
+        fields = {f.name: f for f in dataclasses.fields(schema)} if dataclasses.is_dataclass(schema) else {}
+        if name not in fields:
+            raise UserError(f"{where}: unknown field '{key}'; " + (nearest(walked + name, [walked + f for f in fields]) if fields else f"'{walked[:-1]}' is a value"))
+        schema, walked = fields[name].type, f"{walked}{name}."
+    return schema
+
+
+def _type_name(schema: Any) -> str:
+    names = {float: "a number", int: "a whole number", bool: "true or false", str: "a text"}
+    if schema in names:
+        return names[schema]
+    text = str(schema)
+    if "Literal" in text:
+        return "one of " + ", ".join(schema.__args__)
+    return "a pair [low, high] of numbers" if "tuple" in text else "a list of whole numbers"
+
+
+def _describe(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 40 else text[:37] + "..."
+
+
+def _validate(config: DictConfig, origins: dict[str, str], source: str) -> TaskConfig:
+    missing = OmegaConf.missing_keys(config)
+    if missing:
+        raise UserError(f"{source}: field '{min(missing)}' has no value")
+    task: TaskConfig = OmegaConf.to_object(config)  # type: ignore[assignment]
+    for key, value, meta in _values(task):
+        where = origins.get(key, source)
+        for entry in value if isinstance(value, tuple | list) else [value]:
+            if isinstance(entry, float) and not math.isfinite(entry):
+                raise UserError(f"{where}: {key} must be finite, got {entry}")
+            for bound, limit in meta.get("bounds", {}).items():
+                sign, holds = _BOUNDS[bound]
+                if not holds(entry, limit):
+                    raise UserError(f"{where}: {key} must be {sign} {limit}{' ' + meta['unit'] if meta['unit'] else ''}, got {entry}")
+        if isinstance(value, tuple) and value[0] > value[1]:
+            raise UserError(f"{where}: {key} must be [low, high], got [{value[0]}, {value[1]}]")
+        if value == []:
+            raise UserError(f"{where}: {key} must not be empty")
+    return task
+
+
+_BOUNDS = {
+    "gt": (">", lambda value, limit: value > limit),
+    "ge": (">=", lambda value, limit: value >= limit),
+    "lt": ("<", lambda value, limit: value < limit),
+    "le": ("<=", lambda value, limit: value <= limit),
+}
+
+
+def _values(node: Any, prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Yield (dotted key, value, metadata) of every leaf of a dataclass."""
+    for f in dataclasses.fields(node):
+        value = getattr(node, f.name)
+        if dataclasses.is_dataclass(value):
+            yield from _values(value, f"{prefix}{f.name}.")
+        else:
+            yield f"{prefix}{f.name}", value, f.metadata
+
+
+def _shown(path: Path) -> str:
+    return str(path.relative_to(ROOT)) if path.is_relative_to(ROOT) else str(path)
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())

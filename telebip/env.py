@@ -1,0 +1,227 @@
+"""The vectorised environment: the order of one step, and nothing else. Every term it calls lives in `telebip.mdp`."""
+
+import torch
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
+from torch import Tensor
+
+from telebip.config import TaskConfig
+from telebip.math import rotate_inverse, wrap_angle, yaw
+from telebip.mdp import gait, terminations
+from telebip.mdp.actions import joint_targets
+from telebip.mdp.commands import hold_heading, sample_commands
+from telebip.mdp.context import StepContext
+from telebip.mdp.observations import LAYOUT, heading_relative_quat, noise_amplitude, observation
+from telebip.mdp.randomization import initial_state, sample_pushes, uniform
+from telebip.mdp.rewards import REWARDS
+from telebip.robot import Robot
+from telebip.sim import Backend, SimState, make_simulator
+
+
+class TelebipEnv(VecEnv):
+    """`num_envs` robots that follow velocity commands on flat ground; implements `rsl_rl.env.VecEnv`.
+
+    All buffers are preallocated and written in place; choices between worlds are masks. `step` never waits for the device
+    and never changes a shape. Finished worlds are reset within the step that ends them: their reward and done flag belong to
+    the old episode, their observation to the new one.
+    """
+
+    def __init__(
+        self,
+        cfg: TaskConfig,
+        robot: Robot,
+        device: str | torch.device = "cpu",
+        backend: Backend = "auto",
+    ) -> None:
+        """Create and reset the worlds.
+
+        Args:
+            cfg: the task.
+            robot: from `telebip.robot.load_robot(cfg.sim.robot)`.
+            device: where tensors live.
+            backend: physics engine, see `telebip.sim.make_simulator`.
+        """
+        self.cfg = cfg
+        self.robot = robot
+        self.device = torch.device(device)
+        self.num_envs, self.num_actions = cfg.num_envs, 6
+        self.sim = make_simulator(backend, robot, self.num_envs, cfg.sim.decimation, self.device, ("geom_friction",))
+        self.step_dt = cfg.sim.decimation * robot.physics_dt  # [s]
+        self.max_episode_length = max(1, round(cfg.episode.length / self.step_dt))  # policy steps
+        self.generator = torch.Generator(self.device).manual_seed(cfg.seed)
+
+        def constant(values) -> Tensor:
+            return torch.as_tensor(values, dtype=torch.float32, device=self.device)
+
+        def zeros(*shape: int) -> Tensor:
+            return torch.zeros(self.num_envs, *shape, device=self.device)
+
+        window = gait.window_length(cfg.gait.period, self.step_dt)
+        self._home_qpos, self._nominal, self._force_limit = map(constant, (robot.home_qpos, robot.nominal, robot.force_limit))
+        self._action_scale = constant([cfg.action.hip_roll, cfg.action.hip_pitch, cfg.action.knee] * 2)
+        self._noise_amplitude = constant(noise_amplitude(cfg.disturbance.noise))
+        self._foot_weights = constant(gait.window_weights(window, cfg.reward.foot.gamma, cfg.reward.foot.first))
+        self._friction = self.sim.model_fields["geom_friction"][:, robot.floor_id, 0]  # live, one per world
+
+        self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)  # policy steps since reset
+        self.last_action = zeros(6)
+        self.command = zeros(3)  # what the policy sees: the target command and the heading hold's correction
+        self.target_command = zeros(3)
+        self.reference_heading = zeros()  # [rad]
+        self.push_wrench_w = zeros(6)  # on the trunk's centre of mass, world frame [N, N m]
+        self._push_timer = zeros()  # time until the next push starts [s]
+        self._push_time_left = zeros()  # of the present push [s]
+        self._command_timer = zeros()  # time until the next command [s]
+        self._foot_window = zeros(window)
+        self._base_lin_vel_b = zeros(3)
+        self._command_is_fixed = False
+
+        self.reset()
+
+    def reset(self) -> TensorDict:
+        """Start a new episode in every world and return its observation."""
+        self._reset(torch.ones(self.num_envs, dtype=torch.bool, device=self.device))
+        state = self.sim.state
+        self._base_lin_vel_b.copy_(rotate_inverse(state.base_quat, state.base_lin_vel_w))
+        self._update_commands()
+        return self.get_observations()
+
+    def set_command(self, lin_vel_x: float, lin_vel_y: float, ang_vel_z: float) -> None:
+        """Give every world this command [m/s, m/s, rad/s], for good: no random ones are drawn any more."""
+        self._command_is_fixed = True
+        self.target_command.copy_(torch.tensor([lin_vel_x, lin_vel_y, ang_vel_z]).expand(self.num_envs, -1))
+        self._update_commands()
+
+    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
+        """Apply `actions` (num_envs, 6) for one policy step.
+
+        Returns:
+            Observations {"policy": (num_envs, 33)}, rewards (num_envs,), dones (num_envs,) bool, and extras: `time_outs`
+            (num_envs,) bool, and `log`, a dictionary of scalars on the device: each reward term's mean, errors and faults.
+
+        Raises:
+            ValueError: `actions` has another shape.
+        """
+        if actions.shape != (self.num_envs, self.num_actions):
+            raise ValueError(f"actions must have shape {(self.num_envs, self.num_actions)}, got {tuple(actions.shape)}")
+        cfg = self.cfg
+        # 1. Physics: hold the joint targets for `decimation` steps of the engine.
+        self._update_pushes()
+        state = self.sim.step(joint_targets(actions, self._nominal, self._action_scale), self.push_wrench_w)
+
+        # 2. Clocks and derived quantities at the new time.
+        self.episode_length_buf += 1
+        self._command_timer -= self.step_dt
+        self.reference_heading.copy_(wrap_angle(self.reference_heading + self.step_dt * self.target_command[:, 2]))
+        self._base_lin_vel_b.copy_(rotate_inverse(state.base_quat, state.base_lin_vel_w))
+        sample = gait.foot_sample(self.phase, state.foot_force, self.robot.weight)
+        self._foot_window.copy_(gait.push_sample(self._foot_window, sample))
+
+        # 3. Terminations. A world with a non-finite state ends its episode like a fall, and is counted as a fault.
+        fault = terminations.non_finite(state)
+        terminated = terminations.fallen(state, cfg.episode.min_hip_height) | fault
+        time_outs = terminations.timed_out(self.episode_length_buf, self.max_episode_length) & ~terminated
+        dones = terminated | time_outs
+
+        # 4. Rewards, each a mean in the log. A faulty world earns the termination reward alone.
+        context = StepContext(
+            state=state,
+            base_lin_vel_b=self._base_lin_vel_b,
+            command=self.command,
+            action=actions,
+            last_action=self.last_action,
+            force_limit=self._force_limit,
+            foot_window=self._foot_window,
+            foot_weights=self._foot_weights,
+            fallen=terminated,
+        )
+        terms = torch.stack([term(context, cfg.reward) for term in REWARDS.values()])
+        terms = torch.where(fault & ~torch.isfinite(terms), 0.0, terms)
+        rewards = terms.sum(0)
+        log = self._log(context, terms, fault)
+        self.last_action.copy_(actions)
+
+        # 5. Reset finished worlds, draw new commands where they are due, observe.
+        self._reset(dones)
+        self._base_lin_vel_b.copy_(rotate_inverse(state.base_quat, state.base_lin_vel_w))
+        self._update_commands()
+        return self.get_observations(), rewards, dones, {"time_outs": time_outs, "log": log}
+
+    def get_observations(self) -> TensorDict:
+        """Return a new {"policy": (num_envs, 33)}, with fresh noise where it is enabled; see `mdp.observations.LAYOUT`."""
+        state = self.sim.state
+        quat = heading_relative_quat(state.base_quat, self.reference_heading)
+        obs = observation(state, self._nominal, self.last_action, self._base_lin_vel_b, quat, self.command, self.phase)
+        if self.cfg.disturbance.noise.enabled:
+            obs += self._noise_amplitude * uniform((self.num_envs, obs.shape[1]), -1.0, 1.0, self.generator)
+        return TensorDict({"policy": obs}, batch_size=[self.num_envs], device=self.device)
+
+    @property
+    def phase(self) -> Tensor:
+        """Phase signals (p_r, p_l) at the present time, (num_envs, 2)."""
+        return gait.phase_signals(self.episode_length_buf * self.step_dt, self.cfg.gait.period)
+
+    def _reset(self, mask: Tensor) -> None:
+        """Start a new episode in the worlds where `mask` (num_envs,) holds."""
+        cfg, rows = self.cfg, mask[:, None]
+        qpos, qvel = initial_state(self._home_qpos, self.num_envs, cfg.episode, self.generator)
+        self.sim.reset(mask, qpos, qvel)
+        if cfg.disturbance.friction.enabled:
+            friction = uniform((self.num_envs,), *cfg.disturbance.friction.range, self.generator)
+            self._friction.copy_(torch.where(mask, friction.to(self._friction.dtype), self._friction))
+        push_interval = uniform((self.num_envs,), *cfg.disturbance.push.interval, self.generator)
+        self._push_timer.copy_(torch.where(mask, push_interval, self._push_timer))
+        self.reference_heading.copy_(torch.where(mask, yaw(self.sim.state.base_quat), self.reference_heading))
+        for buffer in (self.episode_length_buf, self._command_timer):
+            buffer.masked_fill_(mask, 0)
+        for buffer in (self.last_action, self._foot_window, self.push_wrench_w):
+            buffer.masked_fill_(rows, 0.0)
+
+    def _update_pushes(self) -> None:
+        """Start a push where its time has come and end it after its duration. The timer counts down to the next start."""
+        cfg = self.cfg.disturbance.push
+        if not cfg.enabled:
+            return
+        interval = uniform((self.num_envs,), *cfg.interval, self.generator)
+        force = sample_pushes(self.num_envs, cfg, self.generator)
+        start = self._push_timer <= 0.0
+        self._push_timer.copy_(torch.where(start, interval, self._push_timer) - self.step_dt)
+        self._push_time_left.copy_(torch.where(start, cfg.duration, self._push_time_left - self.step_dt))
+        kept = torch.where(start[:, None], force, self.push_wrench_w[:, :2])
+        self.push_wrench_w[:, :2] = kept.masked_fill(self._push_time_left[:, None] < 0.5 * self.step_dt, 0.0)
+
+    def _update_commands(self) -> None:
+        """Draw a new command where the last one has expired, and bring the heading hold up to date."""
+        cfg = self.cfg.command
+        if not self._command_is_fixed:
+            new = sample_commands(self.num_envs, cfg, self.generator)
+            due = self._command_timer < 0.5 * self.step_dt
+            self.target_command.copy_(torch.where(due[:, None], new, self.target_command))
+            self._command_timer.copy_(torch.where(due, cfg.resampling_time, self._command_timer))
+        heading = yaw(self.sim.state.base_quat)
+        gain, limit = cfg.heading_gain, cfg.heading_limit
+        self.command.copy_(hold_heading(self.target_command, heading, self.reference_heading, gain, limit))
+
+    def _log(self, context: StepContext, terms: Tensor, fault: Tensor) -> dict[str, Tensor]:
+        """Means over the worlds, as scalars on the device; faulty worlds are left out of all but their own count."""
+        state, valid = context.state, ~fault
+        error = context.command - torch.cat([context.base_lin_vel_b[:, :2], state.base_ang_vel_b[:, 2:]], dim=1)
+        rows = torch.stack(
+            [
+                *terms,
+                torch.linalg.vector_norm(error[:, :2], dim=1),
+                error[:, 2].abs(),
+                state.joint_power.sum(1),
+                torch.linalg.vector_norm(context.base_lin_vel_b[:, :2], dim=1),
+                context.fallen.float(),
+            ]
+        )
+        *rewards, lin_vel_error, yaw_rate_error, power, speed, falls = rows.masked_fill(fault, 0.0).sum(1) / valid.sum()
+        return {
+            **{f"reward/{name}": value for name, value in zip(REWARDS, rewards, strict=True)},
+            "error/lin_vel_mps": lin_vel_error,
+            "error/yaw_rate_radps": yaw_rate_error,
+            "walk/cost_of_transport": power / (self.robot.weight * speed),
+            "walk/falls_per_minute": falls * (60.0 / self.step_dt),
+            "fault/non_finite_worlds": fault.sum(),
+        }

@@ -1,0 +1,18 @@
+"""The one exception that a user is meant to see."""
+
+import difflib
+from collections.abc import Iterable
+
+
+class UserError(Exception):
+    """Something the user can mend: its message is one line that names the thing, the place and what would be valid.
+
+    Every script prints it as `error: <message>` and exits with status 2; anything else that escapes is a bug of ours.
+    """
+
+
+def nearest(name: str, valid: Iterable[str]) -> str:
+    """Return the end of an error line: the closest valid name, or all of them: `nearest("slwo", ["slow", "fast"])`."""
+    valid = sorted(valid)
+    close = difflib.get_close_matches(name, valid, n=1, cutoff=0.5)
+    return f"did you mean '{close[0]}'?" if close else f"valid: {', '.join(valid)}"

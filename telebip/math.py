@@ -1,0 +1,46 @@
+"""Quaternions (w, x, y, z) and frames, batched over leading dimensions."""
+
+import torch
+from torch import Tensor
+
+
+def quat_mul(a: Tensor, b: Tensor) -> Tensor:
+    """Return the Hamilton product a b, (..., 4): the rotation b followed by a."""
+    aw, ax, ay, az = a.unbind(-1)
+    bw, bx, by, bz = b.unbind(-1)
+    return torch.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        dim=-1,
+    )
+
+
+def rotate_inverse(quat: Tensor, vec: Tensor) -> Tensor:
+    """Express `vec` (..., 3), given in the world frame, in the frame whose orientation is the unit `quat` (..., 4).
+
+    v_b = v - 2 w (u x v) + 2 u x (u x v), with quat = (w, u).
+    """
+    w, u = quat[..., :1], quat[..., 1:]
+    t = 2.0 * torch.linalg.cross(u, vec)
+    return vec - w * t + torch.linalg.cross(u, t)
+
+
+def yaw(quat: Tensor) -> Tensor:
+    """Return the heading [rad] of the body's x axis projected on the ground, (...): atan2(R_10, R_00)."""
+    w, x, y, z = quat.unbind(-1)
+    return torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+def quat_from_yaw(angle: Tensor) -> Tensor:
+    """Return the rotation by `angle` [rad] (...) about z, (..., 4)."""
+    half, zero = 0.5 * angle, torch.zeros_like(angle)
+    return torch.stack([torch.cos(half), zero, zero, torch.sin(half)], dim=-1)
+
+
+def wrap_angle(angle: Tensor) -> Tensor:
+    """Return `angle` [rad] wrapped to [-pi, pi)."""
+    return torch.remainder(angle + torch.pi, 2.0 * torch.pi) - torch.pi

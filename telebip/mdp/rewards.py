@@ -1,0 +1,126 @@
+"""The five reward modules: r = r_cmd + r_diff + r_tq + r_foot + r_T, per policy step.
+
+Each term is a pure function; `REWARDS` at the end is the list that the environment sums, beside the YAML that holds every
+coefficient. To add a term: write its function, give it a row in `REWARDS` and its coefficients a place in the configuration.
+"""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from telebip.config import RewardConfig
+from telebip.mdp.context import StepContext
+
+
+def velocity_tracking(lin_vel_b: Tensor, command: Tensor, k_xy: float, sigma_xy: float) -> Tensor:
+    r"""Reward for following the planar velocity command, the first part of r_cmd.
+
+        k_xy exp(-||v_xy_cmd - v_xy|| / sigma_xy)                                            (article, control reward)
+
+    The norm is not squared: the reward has a cusp at zero error, and sigma is a velocity. (legged_gym's `tracking_sigma`
+    divides a squared error; convert before copying values.)
+
+    Args:
+        lin_vel_b: base linear velocity, body frame [m/s], (num_envs, 3).
+        command: (vx, vy, yaw rate), body frame [m/s, m/s, rad/s], (num_envs, 3).
+        k_xy: reward at zero error [-].
+        sigma_xy: error at which the reward falls to k_xy / e [m/s].
+
+    Returns:
+        Reward [-], (num_envs,).
+    """
+    error = torch.linalg.vector_norm(command[:, :2] - lin_vel_b[:, :2], dim=1)
+    return k_xy * torch.exp(-error / sigma_xy)
+
+
+def yaw_rate_tracking(ang_vel_b: Tensor, command: Tensor, k_w: float, sigma_w: float) -> Tensor:
+    r"""Reward for following the yaw-rate command, the second part of r_cmd.
+
+        k_w exp(-|w_cmd - w| / sigma_w)                                                      (article, control reward)
+
+    Args:
+        ang_vel_b: base angular velocity, body frame [rad/s], (num_envs, 3).
+        command: (vx, vy, yaw rate), body frame [m/s, m/s, rad/s], (num_envs, 3).
+        k_w: reward at zero error [-].
+        sigma_w: error at which the reward falls to k_w / e [rad/s].
+
+    Returns:
+        Reward [-], (num_envs,).
+    """
+    return k_w * torch.exp(-(command[:, 2] - ang_vel_b[:, 2]).abs() / sigma_w)
+
+
+def action_difference(action: Tensor, last_action: Tensor, k_diff: float) -> Tensor:
+    r"""Penalty on jerky actions: r_diff = k_diff ||A_t - A_{t-1}||.
+
+    Args:
+        action: A_t [-], (num_envs, 6).
+        last_action: A_{t-1} [-], (num_envs, 6).
+        k_diff: coefficient, not positive [-].
+
+    Returns:
+        Reward [-], (num_envs,).
+    """
+    return k_diff * torch.linalg.vector_norm(action - last_action, dim=1)
+
+
+def torque(joint_force: Tensor, force_limit: Tensor, k_tq: float) -> Tensor:
+    r"""Penalty on actuator effort: r_tq = k_tq ||tau_t / tau_limit||.
+
+    The article's ||tau_t|| would add N m of the hips to N of the prismatic knees; each entry is divided by its actuator's
+    force limit first, so that the norm is dimensionless and 1 means one saturated actuator.
+
+    Args:
+        joint_force: actuator forces, mean over the policy step [N m | N], (num_envs, 6).
+        force_limit: force limits of the actuators [N m | N], (6,).
+        k_tq: coefficient, not positive [-].
+
+    Returns:
+        Reward [-], (num_envs,).
+    """
+    return k_tq * torch.linalg.vector_norm(joint_force / force_limit, dim=1)
+
+
+def periodic_foot_force(window: Tensor, weights: Tensor, k_foot: float) -> Tensor:
+    r"""Reward for pressing with the foot whose phase signal is positive, over one gait period.
+
+        r_foot = k_foot sum_{l=0..N} gamma^l [p_r(tau_l) q_rf(tau_l) + p_l(tau_l) q_lf(tau_l)]   (article, foot reward)
+
+    See `telebip.mdp.gait` for the samples (forces in body weights) and for the two readings of the index l. Samples from
+    before the start of the episode are zero.
+
+    Args:
+        window: samples p_r q_rf + p_l q_lf, newest first [-], (num_envs, N + 1).
+        weights: gamma^l in the window's order [-], (N + 1,).
+        k_foot: coefficient [-].
+
+    Returns:
+        Reward [-], (num_envs,).
+    """
+    return k_foot * (window @ weights)
+
+
+def termination(fallen: Tensor, k_termination: float) -> Tensor:
+    r"""Penalty on a fall: r_T = k_T where the robot has fallen, else 0. A time-out is not a fall.
+
+    Args:
+        fallen: bool, (num_envs,).
+        k_termination: -1 in the article [-].
+
+    Returns:
+        Reward [-], (num_envs,).
+    """
+    return k_termination * fallen.float()
+
+
+REWARDS: dict[str, Callable[[StepContext, RewardConfig], Tensor]] = {
+    "cmd": lambda s, c: (
+        velocity_tracking(s.base_lin_vel_b, s.command, c.cmd.k_xy, c.cmd.sigma_xy)
+        + yaw_rate_tracking(s.state.base_ang_vel_b, s.command, c.cmd.k_w, c.cmd.sigma_w)
+    ),
+    "diff": lambda s, c: action_difference(s.action, s.last_action, c.diff.k_diff),
+    "tq": lambda s, c: torque(s.state.joint_force, s.force_limit, c.tq.k_tq),
+    "foot": lambda s, c: periodic_foot_force(s.foot_window, s.foot_weights, c.foot.k_foot),
+    "termination": lambda s, c: termination(s.fallen, c.termination.k_termination),
+}

@@ -1,0 +1,1 @@
+"""Training with rsl-rl's PPO, and the checkpoints it leaves."""

@@ -1,0 +1,49 @@
+"""From a configuration to rsl-rl's networks, and from a checkpoint to a policy."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from rsl_rl.models import MLPModel
+from tensordict import TensorDict
+from torch import Tensor
+
+from telebip.config import PpoConfig
+from telebip.errors import UserError
+from telebip.mdp.observations import LAYOUT
+from telebip.rl.checkpoint import Checkpoint
+from telebip.robot import JOINTS
+
+OBS_GROUPS = {"actor": ["policy"], "critic": ["policy"]}
+
+
+def actor_cfg(ppo: PpoConfig) -> dict[str, Any]:
+    """Arguments of the actor's `MLPModel`: a Gaussian whose mean is an MLP and whose deviation is a parameter."""
+    return {
+        **critic_cfg(ppo),
+        "distribution_cfg": {
+            "class_name": "GaussianDistribution",
+            "init_std": ppo.init_std,
+            "std_range": (ppo.min_std, 1e6),
+        },
+    }
+
+
+def critic_cfg(ppo: PpoConfig) -> dict[str, Any]:
+    """Arguments of the critic's `MLPModel`."""
+    return {"hidden_dims": list(ppo.hidden_dims), "activation": ppo.activation, "obs_normalization": ppo.obs_normalization}
+
+
+def load_policy(checkpoint: Checkpoint, device: str | torch.device) -> Callable[[TensorDict], Tensor]:
+    """Return the checkpoint's deterministic policy: observations {"policy": (num_envs, 33)} to actions (num_envs, 6).
+
+    Raises:
+        UserError: the weights do not fit the configuration they came with.
+    """
+    obs = TensorDict({"policy": torch.zeros(1, sum(LAYOUT.values()))}, batch_size=[1])
+    actor = MLPModel(obs, OBS_GROUPS, "actor", len(JOINTS), **actor_cfg(checkpoint.config.ppo))
+    try:
+        actor.load_state_dict(checkpoint.learner["actor_state_dict"])
+    except (RuntimeError, KeyError) as error:
+        raise UserError(f"checkpoint '{checkpoint.path}': its weights do not fit its configuration") from error
+    return actor.to(device).eval()

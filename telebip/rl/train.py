@@ -1,0 +1,177 @@
+"""The training loop around rsl-rl's PPO.
+
+rsl-rl's `OnPolicyRunner` prints a page per iteration, waits for the device at every environment step to log, and loads
+checkpoints as pickles; this loop uses its algorithm, networks and storage and does these three differently.
+"""
+
+import contextlib
+import io
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from rsl_rl.algorithms import PPO
+from torch import Tensor
+from torch.utils.tensorboard import SummaryWriter
+
+from telebip.env import TelebipEnv
+from telebip.errors import UserError
+from telebip.rl.checkpoint import Checkpoint, save_checkpoint
+from telebip.rl.policy import OBS_GROUPS, actor_cfg, critic_cfg
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a person watches, after each iteration."""
+
+    iteration: int  # finished iterations
+    samples: int
+    samples_per_s: float
+    reward: float  # mean return of recent episodes
+    episode_length: float  # their mean length, policy steps
+    lin_vel_error: float  # mean over this iteration [m/s]
+    falls_per_minute: float  # per robot
+
+
+class Trainer:
+    """Trains one policy in one run folder."""
+
+    def __init__(self, env: TelebipEnv, task: str, run_dir: Path) -> None:
+        """Build the learner for `env`; nothing is written before `learn`."""
+        self.env, self.task, self.run_dir = env, task, run_dir
+        self.iteration = self.samples = 0
+        ppo = env.cfg.ppo
+        if ppo.num_mini_batches > env.num_envs * ppo.num_steps_per_env:
+            raise UserError(
+                f"ppo.num_mini_batches is {ppo.num_mini_batches}, but an iteration has only {env.num_envs} worlds x "
+                f"{ppo.num_steps_per_env} steps"
+            )
+        torch.manual_seed(env.cfg.seed)
+        with contextlib.redirect_stdout(io.StringIO()):  # rsl-rl prints the networks
+            self.learner = PPO.construct_algorithm(env.get_observations(), env, _rsl_rl_cfg(env), str(env.device))
+        self._episodes = EpisodeStatistics(env.num_envs, env.device)
+
+    def resume(self, checkpoint: Checkpoint) -> None:
+        """Continue from a checkpoint of the same task."""
+        try:
+            self.learner.load(checkpoint.learner, load_cfg=None, strict=True)
+        except (RuntimeError, KeyError, ValueError) as error:
+            raise UserError(f"checkpoint '{checkpoint.path}' cannot be resumed: {' '.join(str(error).split())[:120]}") from error
+        self.iteration, self.samples = checkpoint.iteration, checkpoint.samples
+
+    def learn(self, stop: Callable[[], bool], report: Callable[[Progress], None]) -> None:
+        """Train up to the configured total of iterations, or until `stop()` holds, and save a checkpoint at the end.
+
+        Args:
+            stop: asked after every iteration.
+            report: called after every iteration.
+        """
+        env, learner, cfg = self.env, self.learner, self.env.cfg.ppo
+        writer = SummaryWriter(str(self.run_dir), purge_step=self.samples)
+        if self.iteration == 0:  # spread the time-outs over the iterations
+            ages = torch.randint(env.max_episode_length, (env.num_envs,), generator=env.generator, device=env.device)
+            env.episode_length_buf = ages
+        learner.train_mode()
+        obs = env.get_observations()
+        while self.iteration < cfg.max_iterations and not stop():
+            start = time.perf_counter()
+            logs: dict[str, Tensor] = {}
+            with torch.inference_mode():
+                for _ in range(cfg.num_steps_per_env):
+                    obs, rewards, dones, extras = env.step(learner.act(obs))
+                    learner.process_env_step(obs, rewards, dones, extras)
+                    self._episodes.add(rewards, dones)
+                    logs = {key: logs.get(key, 0) + value for key, value in extras["log"].items()}
+                collected = time.perf_counter()
+                learner.compute_returns(obs)
+            losses = learner.update()
+            learned = time.perf_counter()
+
+            self.iteration += 1
+            batch = env.num_envs * cfg.num_steps_per_env
+            self.samples += batch
+            scalars = {key: value.item() / (1 if key.startswith("fault/") else cfg.num_steps_per_env) for key, value in logs.items()}
+            episode_return, episode_length = self._episodes.recent()
+            scalars |= {
+                "train/episode_return": episode_return,
+                "train/episode_length": episode_length,
+                "train/action_std": learner.get_policy().output_std.mean().item(),
+                "train/learning_rate": learner.learning_rate,
+                **{f"loss/{key}": value for key, value in losses.items()},
+                "speed/samples_per_s": batch / (learned - start),
+                "speed/collect_s": collected - start,
+                "speed/learn_s": learned - collected,
+            }
+            for key, value in scalars.items():
+                writer.add_scalar(key, value, self.samples)
+            if self.iteration % cfg.save_interval == 0:
+                self.save()
+            report(
+                Progress(
+                    self.iteration,
+                    self.samples,
+                    scalars["speed/samples_per_s"],
+                    episode_return,
+                    episode_length,
+                    scalars["error/lin_vel_mps"],
+                    scalars["walk/falls_per_minute"],
+                )
+            )
+        self.save()
+        writer.close()
+
+    def save(self) -> None:
+        """Write `model_<iteration>.pt`, to go on from, and `policy.pt`, the networks alone."""
+        state = self.learner.save()
+        save_checkpoint(self.run_dir / f"model_{self.iteration}.pt", self.task, self.env.cfg, self.iteration, self.samples, state)
+        actor = {"actor_state_dict": state["actor_state_dict"]}
+        save_checkpoint(self.run_dir / "policy.pt", self.task, self.env.cfg, self.iteration, self.samples, actor)
+
+
+class EpisodeStatistics:
+    """Mean return and length of the episodes that ended lately, kept on the device until asked."""
+
+    def __init__(self, num_envs: int, device: torch.device, min_episodes: int = 100) -> None:
+        """Average over as many of the latest iterations as it takes to see `min_episodes` end."""
+        self._return, self._length = torch.zeros(num_envs, device=device), torch.zeros(num_envs, device=device)
+        self._sums = torch.zeros(3, device=device)  # of finished episodes: returns, lengths, number
+        self._history: deque[tuple[float, float, float]] = deque()
+        self._min_episodes = min_episodes
+
+    def add(self, rewards: Tensor, dones: Tensor) -> None:
+        """Account for one environment step: rewards (num_envs,) and dones (num_envs,) bool."""
+        self._return += rewards
+        self._length += 1.0
+        done = dones.float()
+        self._sums += torch.stack([self._return @ done, self._length @ done, done.sum()])
+        self._return.masked_fill_(dones, 0.0)
+        self._length.masked_fill_(dones, 0.0)
+
+    def recent(self) -> tuple[float, float]:
+        """Return (mean return, mean length in policy steps), NaN before any episode has ended; call once per iteration."""
+        returns, lengths, number = self._sums.tolist()
+        self._history.append((returns, lengths, number))
+        self._sums.zero_()
+        while sum(n for *_, n in self._history) - self._history[0][2] >= self._min_episodes:
+            self._history.popleft()
+        total = [sum(column) for column in zip(*self._history, strict=True)]
+        return (total[0] / total[2], total[1] / total[2]) if total[2] else (float("nan"), float("nan"))
+
+
+def _rsl_rl_cfg(env: TelebipEnv) -> dict:
+    ppo = env.cfg.ppo
+    algorithm = (
+        "num_learning_epochs num_mini_batches learning_rate schedule desired_kl gamma lam clip_param value_loss_coef "
+        "entropy_coef max_grad_norm use_mixed_precision"
+    )
+    return {
+        "num_steps_per_env": ppo.num_steps_per_env,
+        "obs_groups": OBS_GROUPS,
+        "multi_gpu": None,
+        "algorithm": {"class_name": "PPO", **{name: getattr(ppo, name) for name in algorithm.split()}},
+        "actor": {"class_name": "MLPModel", **actor_cfg(ppo)},
+        "critic": {"class_name": "MLPModel", **critic_cfg(ppo)},
+    }

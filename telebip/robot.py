@@ -1,0 +1,90 @@
+"""The robot as its MJCF describes it: names, order, nominal pose and limits."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from telebip import ROOT
+from telebip.errors import UserError, nearest
+
+JOINTS = ("right_hip_roll", "right_hip_pitch", "right_knee", "left_hip_roll", "left_hip_pitch", "left_knee")
+"""Joints and their actuators, in the order of actions and observations: right leg first, as the phase signals (p_r, p_l)."""
+
+FEET = ("right_foot", "left_foot")
+TRUNK, FLOOR, KEYFRAME = "trunk", "floor", "home"
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A compiled model and what the MDP reads from it. Arrays follow the order of `JOINTS` and `FEET`; knees in m and N."""
+
+    path: Path
+    model: mujoco.MjModel
+    home_qpos: NDArray[np.float64]  # (13,) standing on the ground, heading along x
+    nominal: NDArray[np.float64]  # (6,) joint positions of the home pose [rad | m]
+    joint_range: NDArray[np.float64]  # (6, 2) [rad | m]
+    force_limit: NDArray[np.float64]  # (6,) actuator force limits [N m | N]
+    weight: float  # m g [N]
+    trunk_id: int
+    floor_id: int
+    foot_sensor_adr: tuple[int, int]  # columns of `sensordata` that hold the feet's normal forces
+
+    @property
+    def physics_dt(self) -> float:
+        """Physics step [s]."""
+        return float(self.model.opt.timestep)
+
+
+def load_robot(path: str | Path) -> Robot:
+    """Load a six-actuator biped; relative paths start at the working directory, then at telebip's own folder.
+
+    The MJCF must name the free-floating body `trunk`, the geom `floor`, the joints of `JOINTS` with one actuator each of the
+    same name, a touch sensor `<foot>_force` for each of `FEET`, and the keyframe `home`.
+
+    Raises:
+        UserError: the file is missing or is no valid MJCF, or a name is missing; the message says which.
+    """
+    file = next((p for p in (Path(path), ROOT / path) if p.is_file()), None)
+    if file is None:
+        raise UserError(f"robot file '{path}' does not exist")
+    try:
+        model = mujoco.MjModel.from_xml_path(str(file))
+    except ValueError as error:
+        raise UserError(f"{path}: {' '.join(str(error).split())}") from error
+    joints = [_id(model, mujoco.mjtObj.mjOBJ_JOINT, name, path) for name in JOINTS]
+    actuators = [_id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name, path) for name in JOINTS]
+    trunk = _id(model, mujoco.mjtObj.mjOBJ_BODY, TRUNK, path)
+    floor = _id(model, mujoco.mjtObj.mjOBJ_GEOM, FLOOR, path)
+    sensors = [_id(model, mujoco.mjtObj.mjOBJ_SENSOR, f"{foot}_force", path) for foot in FEET]
+    home = model.key(_id(model, mujoco.mjtObj.mjOBJ_KEY, KEYFRAME, path))
+    if (model.nq, model.nv, model.nu) != (13, 12, 6) or list(model.jnt_qposadr[joints]) != list(range(7, 13)):
+        raise UserError(f"{path}: expected a free joint followed by {', '.join(JOINTS)}, in this order, with one actuator each")
+    if list(actuators) != list(range(6)) or list(model.actuator_trnid[:, 0]) != joints:
+        raise UserError(f"{path}: actuators must drive {', '.join(JOINTS)}, in this order")
+    if not model.actuator_forcelimited.all():
+        raise UserError(f"{path}: every actuator needs a forcerange")
+    return Robot(
+        path=file,
+        model=model,
+        home_qpos=home.qpos.copy(),
+        nominal=home.qpos[7:].copy(),
+        joint_range=model.jnt_range[joints].copy(),
+        force_limit=model.actuator_forcerange[:, 1].copy(),
+        weight=float(model.body_subtreemass[trunk] * np.linalg.norm(model.opt.gravity)),
+        trunk_id=trunk,
+        floor_id=floor,
+        foot_sensor_adr=(int(model.sensor_adr[sensors[0]]), int(model.sensor_adr[sensors[1]])),
+    )
+
+
+def _id(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str, path: str | Path) -> int:
+    index = mujoco.mj_name2id(model, kind, name)
+    if index < 0:
+        label = kind.name.removeprefix("mjOBJ_").lower()
+        count = {"joint": model.njnt, "actuator": model.nu, "body": model.nbody, "geom": model.ngeom, "sensor": model.nsensor, "key": model.nkey}
+        names = [mujoco.mj_id2name(model, kind, i) or "" for i in range(count[label])]
+        raise UserError(f"{path}: no {label} named '{name}'; {nearest(name, filter(None, names))}")
+    return index

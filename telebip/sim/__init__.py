@@ -1,0 +1,40 @@
+"""Physics backends behind one interface; see `telebip.sim.base`."""
+
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+
+from telebip.errors import UserError
+from telebip.robot import Robot
+from telebip.sim.base import SimState, Simulator
+
+__all__ = ["Backend", "SimState", "Simulator", "make_simulator"]
+
+Backend = Literal["auto", "native", "warp"]
+
+
+def make_simulator(
+    backend: Backend,
+    robot: Robot,
+    num_envs: int,
+    decimation: int,
+    device: torch.device,
+    model_fields: Sequence[str] = (),
+) -> Simulator:
+    """Create the backend: `auto` is `warp` on CUDA and `native` on the CPU.
+
+    Raises:
+        UserError: `native` was asked for on a CUDA device.
+    """
+    if backend == "auto":
+        backend = "warp" if device.type == "cuda" else "native"
+    if backend == "native":
+        if device.type != "cpu":
+            raise UserError(f"backend 'native' runs on the CPU, not on '{device}'; use --backend warp or --device cpu")
+        from telebip.sim.native import NativeSimulator
+
+        return NativeSimulator(robot, num_envs, decimation, model_fields)
+    from telebip.sim.warp import WarpSimulator
+
+    return WarpSimulator(robot, num_envs, decimation, device, model_fields)

@@ -1,0 +1,74 @@
+"""C MuJoCo on a thread pool: the engine of machines without a GPU, bit-identical to a loop of `mj_step`."""
+
+import copy
+from collections.abc import Sequence
+
+import mujoco
+import torch
+from mujoco.batch import Batch
+from torch import Tensor
+
+from telebip.robot import Robot
+from telebip.sim.base import SimState
+
+
+class NativeSimulator:
+    """`Simulator` on `mujoco.batch.Batch`. States are float64 inside and float32 in `state`; results do not depend on threads."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        num_envs: int,
+        decimation: int,
+        model_fields: Sequence[str] = (),
+        num_threads: int = 0,
+    ) -> None:
+        """Create the worlds in the home pose.
+
+        Args:
+            robot: the model.
+            num_envs: number of worlds.
+            decimation: physics steps per `step`.
+            model_fields: names of `mujoco.MjModel` fields that get one value per world.
+            num_threads: physics threads; 0 is one per processor.
+        """
+        self.num_envs = num_envs
+        self.device = torch.device("cpu")
+        self.state = SimState.zeros(num_envs, self.device)
+        self._decimation = decimation
+        self._foot_adr = list(robot.foot_sensor_adr)
+        model = copy.copy(robot.model)
+        # A non-finite state stays, to be seen and counted by the environment; the engine would silently reset it.
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        self._batch = Batch(model, num_envs, num_threads)
+        self._qpos, self._qvel, self._warmstart, self._ctrl, self._time = (
+            torch.from_numpy(self._batch.bind(name)) for name in ("qpos", "qvel", "qacc_warmstart", "ctrl", "time")
+        )
+        self._trunk_wrench = torch.from_numpy(self._batch.bind("xfrc_applied"))[:, robot.trunk_id]
+        self.model_fields = {name: torch.from_numpy(self._batch.expand(name)) for name in model_fields}
+        # Every physics step's values, (num_envs, decimation, ...), written by the engine's threads.
+        self._record = self._batch.rollout(1, record=("actuator_force", "actuator_velocity", "sensordata"))
+        self._record = {k: v.repeat(decimation, axis=1) for k, v in self._record.items()}
+        self._force, self._velocity, self._sensors = (torch.from_numpy(v) for v in self._record.values())
+        home = torch.from_numpy(robot.home_qpos).float().expand(num_envs, -1)
+        self.reset(torch.ones(num_envs, dtype=torch.bool), home, torch.zeros(num_envs, 12))
+
+    def step(self, targets: Tensor, wrench_w: Tensor) -> SimState:
+        """See `Simulator.step`."""
+        self._ctrl.copy_(targets)
+        self._trunk_wrench.copy_(wrench_w)
+        self._batch.rollout(self._decimation, record=tuple(self._record), out=self._record)
+        self.state.qpos.copy_(self._qpos)
+        self.state.qvel.copy_(self._qvel)
+        self.state.foot_force.copy_(self._sensors[:, :, self._foot_adr].mean(1))
+        self.state.joint_force.copy_(self._force.mean(1))
+        self.state.joint_power.copy_((self._force * self._velocity).abs_().mean(1))
+        return self.state
+
+    def reset(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
+        """See `Simulator.reset`."""
+        rows = mask[:, None]
+        for target, value in ((self._qpos, qpos), (self._qvel, qvel), (self.state.qpos, qpos), (self.state.qvel, qvel)):
+            target.copy_(torch.where(rows, value.to(target.dtype), target))
+        for target in (self._warmstart, self._time, self.state.foot_force, self.state.joint_force, self.state.joint_power):
+            target.masked_fill_(rows if target.dim() == 2 else mask, 0.0)

@@ -1,0 +1,136 @@
+"""MuJoCo Warp: the engine of NVIDIA GPUs, one CUDA graph per policy step. It runs on the CPU too, slowly, to be tested there.
+
+The only file that imports `mujoco_warp`. Torch tensors and Warp arrays share memory in both directions.
+"""
+
+from collections.abc import Sequence
+
+import mujoco_warp as mjw
+import torch
+import warp as wp
+from torch import Tensor
+
+from telebip.robot import Robot
+from telebip.sim.base import SimState
+
+MAX_CONTACTS, MAX_CONSTRAINTS = 8, 64
+"""Per world: two feet, the feet against each other and a fallen trunk make 7 contacts of 6 rows; joint limits add 6."""
+
+
+@wp.kernel
+def _accumulate(
+    actuator_force: wp.array2d[float],
+    actuator_velocity: wp.array2d[float],
+    sensordata: wp.array2d[float],
+    right_adr: int,
+    left_adr: int,
+    scale: float,
+    joint_force: wp.array2d[float],
+    joint_power: wp.array2d[float],
+    foot_force: wp.array2d[float],
+):
+    """Add one physics step's share, `scale` = 1 / decimation, to the means over a policy step."""
+    world, i = wp.tid()
+    force = actuator_force[world, i]
+    joint_force[world, i] += scale * force
+    joint_power[world, i] += scale * wp.abs(force * actuator_velocity[world, i])
+    if i == 0:
+        foot_force[world, 0] += scale * sensordata[world, right_adr]
+        foot_force[world, 1] += scale * sensordata[world, left_adr]
+
+
+class WarpSimulator:
+    """`Simulator` on `mujoco_warp`, float32 throughout."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        num_envs: int,
+        decimation: int,
+        device: torch.device,
+        model_fields: Sequence[str] = (),
+    ) -> None:
+        """Create the worlds in the home pose; the first use on a machine compiles kernels for a minute or more.
+
+        Args:
+            robot: the model.
+            num_envs: number of worlds.
+            decimation: physics steps per `step`.
+            device: where to simulate.
+            model_fields: names of model fields that get one value per world.
+        """
+        self.num_envs = num_envs
+        self.device = device
+        self._decimation = decimation
+        self._foot_adr = robot.foot_sensor_adr
+        wp.init()
+        self._wp_device = wp.device_from_torch(device)
+        with wp.ScopedDevice(self._wp_device):
+            self._model = mjw.put_model(robot.model, batch_sizes=dict.fromkeys(model_fields, num_envs))
+            self._data = mjw.make_data(robot.model, nworld=num_envs, nconmax=MAX_CONTACTS, njmax=MAX_CONSTRAINTS)
+        self.model_fields = {name: wp.to_torch(getattr(self._model, name)) for name in model_fields}
+        for name, field in self.model_fields.items():
+            field.copy_(torch.as_tensor(getattr(robot.model, name), dtype=field.dtype).reshape(field.shape[1:]).expand_as(field))
+        self.state = SimState(
+            qpos=wp.to_torch(self._data.qpos),
+            qvel=wp.to_torch(self._data.qvel),
+            foot_force=torch.zeros(num_envs, 2, device=device),
+            joint_force=torch.zeros(num_envs, 6, device=device),
+            joint_power=torch.zeros(num_envs, 6, device=device),
+        )
+        self._means = [wp.from_torch(t) for t in (self.state.joint_force, self.state.joint_power, self.state.foot_force)]
+        self._ctrl, self._warmstart, self._time = (
+            wp.to_torch(a) for a in (self._data.ctrl, self._data.qacc_warmstart, self._data.time)
+        )
+        self._trunk_wrench = wp.to_torch(self._data.xfrc_applied)[:, robot.trunk_id]
+        self._graph = self._capture() if self._wp_device.is_cuda else None
+        home = torch.as_tensor(robot.home_qpos, dtype=torch.float32, device=device).expand(num_envs, -1)
+        self.reset(
+            torch.ones(num_envs, dtype=torch.bool, device=device), home, torch.zeros(num_envs, 12, device=device)
+        )
+
+    def step(self, targets: Tensor, wrench_w: Tensor) -> SimState:
+        """See `Simulator.step`."""
+        self._ctrl.copy_(targets)
+        self._trunk_wrench.copy_(wrench_w)
+        if self._graph is None:
+            self._launch()
+        else:
+            # On torch's stream, so that torch's work before and after is ordered with it without a synchronisation.
+            wp.capture_launch(self._graph, stream=wp.stream_from_torch(torch.cuda.current_stream(self.device)))
+        return self.state
+
+    def reset(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
+        """See `Simulator.reset`."""
+        rows = mask[:, None]
+        self.state.qpos.copy_(torch.where(rows, qpos, self.state.qpos))
+        self.state.qvel.copy_(torch.where(rows, qvel, self.state.qvel))
+        for target in (self._warmstart, self._time, self.state.foot_force, self.state.joint_force, self.state.joint_power):
+            target.masked_fill_(rows if target.dim() == 2 else mask, 0.0)
+
+    def _launch(self) -> None:
+        """Run the physics steps of one policy step."""
+        with wp.ScopedDevice(self._wp_device):
+            for mean in self._means:
+                mean.zero_()
+            for _ in range(self._decimation):
+                mjw.step(self._model, self._data)
+                wp.launch(
+                    _accumulate,
+                    dim=(self.num_envs, 6),
+                    inputs=[
+                        self._data.actuator_force,
+                        self._data.actuator_velocity,
+                        self._data.sensordata,
+                        *self._foot_adr,
+                        1.0 / self._decimation,
+                    ],
+                    outputs=self._means,
+                )
+
+    def _capture(self) -> wp.Graph:
+        """Compile and warm up, then record `_launch` as a CUDA graph."""
+        self._launch()
+        with wp.ScopedCapture(device=self._wp_device) as capture:
+            self._launch()
+        return capture.graph
