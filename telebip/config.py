@@ -286,7 +286,9 @@ def _apply(config: DictConfig, leaves: list[tuple[str, Any, str]], origins: dict
     for key, value, where in leaves:
         schema = _schema_of(key, where)
         if dataclasses.is_dataclass(schema):
-            raise UserError(f"{where}: {key} is a section; set one of its fields: {', '.join(f.name for f in dataclasses.fields(schema))}")
+            raise UserError(
+                f"{where}: {key} is a section; set one of its fields: {', '.join(f.name for f in dataclasses.fields(schema))}"
+            )
         try:
             OmegaConf.update(config, key, value)
         except (OmegaConfBaseException, OverflowError, ValueError, TypeError) as error:
@@ -301,7 +303,10 @@ def _schema_of(key: str, where: str) -> Any:
     for name in key.split("."):
         fields = {f.name: f for f in dataclasses.fields(schema)} if dataclasses.is_dataclass(schema) else {}
         if name not in fields:
-            raise UserError(f"{where}: unknown field '{key}'; " + (nearest(walked + name, [walked + f for f in fields]) if fields else f"'{walked[:-1]}' is a value"))
+            raise UserError(
+                f"{where}: unknown field '{key}'; "
+                + (nearest(walked + name, [walked + f for f in fields]) if fields else f"'{walked[:-1]}' is a value")
+            )
         schema, walked = fields[name].type, f"{walked}{name}."
     return schema
 
@@ -334,7 +339,9 @@ def _validate(config: DictConfig, origins: dict[str, str], source: str) -> TaskC
             for bound, limit in meta.get("bounds", {}).items():
                 sign, holds = _BOUNDS[bound]
                 if not holds(entry, limit):
-                    raise UserError(f"{where}: {key} must be {sign} {limit}{' ' + meta['unit'] if meta['unit'] else ''}, got {entry}")
+                    raise UserError(
+                        f"{where}: {key} must be {sign} {limit}{' ' + meta['unit'] if meta['unit'] else ''}, got {entry}"
+                    )
         if isinstance(value, tuple) and value[0] > value[1]:
             raise UserError(f"{where}: {key} must be [low, high], got [{value[0]}, {value[1]}]")
         if value == []:

@@ -11,11 +11,11 @@ from telebip.mdp import gait, terminations
 from telebip.mdp.actions import joint_targets
 from telebip.mdp.commands import hold_heading, sample_commands
 from telebip.mdp.context import StepContext
-from telebip.mdp.observations import LAYOUT, heading_relative_quat, noise_amplitude, observation
+from telebip.mdp.observations import heading_relative_quat, noise_amplitude, observation
 from telebip.mdp.randomization import initial_state, sample_pushes, uniform
 from telebip.mdp.rewards import REWARDS
 from telebip.robot import Robot
-from telebip.sim import Backend, SimState, make_simulator
+from telebip.sim import Backend, make_simulator
 
 
 class TelebipEnv(VecEnv):
@@ -65,6 +65,7 @@ class TelebipEnv(VecEnv):
 
         self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)  # policy steps since reset
         self.last_action = zeros(6)
+        self.joint_target = zeros(6)  # [rad | m]
         self.command = zeros(3)  # what the policy sees: the target command and the heading hold's correction
         self.target_command = zeros(3)
         self.reference_heading = zeros()  # [rad]
@@ -107,7 +108,8 @@ class TelebipEnv(VecEnv):
         cfg = self.cfg
         # 1. Physics: hold the joint targets for `decimation` steps of the engine.
         self._update_pushes()
-        state = self.sim.step(joint_targets(actions, self._nominal, self._action_scale), self.push_wrench_w)
+        self.joint_target.copy_(joint_targets(actions, self._nominal, self._action_scale))
+        state = self.sim.step(self.joint_target, self.push_wrench_w)
 
         # 2. Clocks and derived quantities at the new time.
         self.episode_length_buf += 1
@@ -123,7 +125,7 @@ class TelebipEnv(VecEnv):
         time_outs = terminations.timed_out(self.episode_length_buf, self.max_episode_length) & ~terminated
         dones = terminated | time_outs
 
-        # 4. Rewards, each a mean in the log. A faulty world earns the termination reward alone.
+        # 4. Rewards. What a fault has made non-finite counts as zero, in its own world alone.
         context = StepContext(
             state=state,
             base_lin_vel_b=self._base_lin_vel_b,

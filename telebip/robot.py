@@ -84,7 +84,14 @@ def _id(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str, path: str | Path)
     index = mujoco.mj_name2id(model, kind, name)
     if index < 0:
         label = kind.name.removeprefix("mjOBJ_").lower()
-        count = {"joint": model.njnt, "actuator": model.nu, "body": model.nbody, "geom": model.ngeom, "sensor": model.nsensor, "key": model.nkey}
+        count = {
+            "joint": model.njnt,
+            "actuator": model.nu,
+            "body": model.nbody,
+            "geom": model.ngeom,
+            "sensor": model.nsensor,
+            "key": model.nkey,
+        }
         names = [mujoco.mj_id2name(model, kind, i) or "" for i in range(count[label])]
         raise UserError(f"{path}: no {label} named '{name}'; {nearest(name, filter(None, names))}")
     return index

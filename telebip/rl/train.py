@@ -59,7 +59,9 @@ class Trainer:
         try:
             self.learner.load(checkpoint.learner, load_cfg=None, strict=True)
         except (RuntimeError, KeyError, ValueError) as error:
-            raise UserError(f"checkpoint '{checkpoint.path}' cannot be resumed: {' '.join(str(error).split())[:120]}") from error
+            raise UserError(
+                f"checkpoint '{checkpoint.path}' cannot be resumed: {' '.join(str(error).split())[:120]}"
+            ) from error
         self.iteration, self.samples = checkpoint.iteration, checkpoint.samples
 
     def learn(self, stop: Callable[[], bool], report: Callable[[Progress], None]) -> None:
@@ -93,7 +95,9 @@ class Trainer:
             self.iteration += 1
             batch = env.num_envs * cfg.num_steps_per_env
             self.samples += batch
-            scalars = {key: value.item() / (1 if key.startswith("fault/") else cfg.num_steps_per_env) for key, value in logs.items()}
+            scalars = {
+                key: value.item() / (1 if key.startswith("fault/") else cfg.num_steps_per_env) for key, value in logs.items()
+            }
             episode_return, episode_length = self._episodes.recent()
             scalars |= {
                 "train/episode_return": episode_return,
@@ -126,7 +130,9 @@ class Trainer:
     def save(self) -> None:
         """Write `model_<iteration>.pt`, to go on from, and `policy.pt`, the networks alone."""
         state = self.learner.save()
-        save_checkpoint(self.run_dir / f"model_{self.iteration}.pt", self.task, self.env.cfg, self.iteration, self.samples, state)
+        save_checkpoint(
+            self.run_dir / f"model_{self.iteration}.pt", self.task, self.env.cfg, self.iteration, self.samples, state
+        )
         actor = {"actor_state_dict": state["actor_state_dict"]}
         save_checkpoint(self.run_dir / "policy.pt", self.task, self.env.cfg, self.iteration, self.samples, actor)
 

@@ -16,7 +16,9 @@ class SimState:
     """
 
     qpos: Tensor  # (num_envs, 13): trunk position [m] and quaternion, joint positions [rad | m]
-    qvel: Tensor  # (num_envs, 12): trunk velocity, world frame [m/s], angular velocity, body frame [rad/s], joints [rad/s | m/s]
+    qvel: (
+        Tensor  # (num_envs, 12): trunk velocity, world frame [m/s], angular velocity, body frame [rad/s], joints [rad/s | m/s]
+    )
     foot_force: Tensor  # (num_envs, 2): normal ground force on the right and the left foot [N]
     joint_force: Tensor  # (num_envs, 6): actuator force [N m | N]
     joint_power: Tensor  # (num_envs, 6): |actuator force x joint velocity| [W]

@@ -70,7 +70,9 @@ class WarpSimulator:
             self._data = mjw.make_data(robot.model, nworld=num_envs, nconmax=MAX_CONTACTS, njmax=MAX_CONSTRAINTS)
         self.model_fields = {name: wp.to_torch(getattr(self._model, name)) for name in model_fields}
         for name, field in self.model_fields.items():
-            field.copy_(torch.as_tensor(getattr(robot.model, name), dtype=field.dtype).reshape(field.shape[1:]).expand_as(field))
+            field.copy_(
+                torch.as_tensor(getattr(robot.model, name), dtype=field.dtype).reshape(field.shape[1:]).expand_as(field)
+            )
         self.state = SimState(
             qpos=wp.to_torch(self._data.qpos),
             qvel=wp.to_torch(self._data.qvel),
@@ -85,9 +87,7 @@ class WarpSimulator:
         self._trunk_wrench = wp.to_torch(self._data.xfrc_applied)[:, robot.trunk_id]
         self._graph = self._capture() if self._wp_device.is_cuda else None
         home = torch.as_tensor(robot.home_qpos, dtype=torch.float32, device=device).expand(num_envs, -1)
-        self.reset(
-            torch.ones(num_envs, dtype=torch.bool, device=device), home, torch.zeros(num_envs, 12, device=device)
-        )
+        self.reset(torch.ones(num_envs, dtype=torch.bool, device=device), home, torch.zeros(num_envs, 12, device=device))
 
     def step(self, targets: Tensor, wrench_w: Tensor) -> SimState:
         """See `Simulator.step`."""

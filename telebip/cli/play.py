@@ -1,0 +1,156 @@
+"""`play.py`: walk a policy, measure it, and record it."""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from telebip.cli.common import Parser, resolve_device
+from telebip.config import TaskConfig, load_task
+from telebip.errors import UserError
+
+EXAMPLES = """\
+  play.py --checkpoint assets/policies/telebip_flat --record walk.rrd      (then: rerun walk.rrd)
+  play.py --checkpoint runs/telebip_flat/2026-01-31_12-00-00 --command 0.7 0 0
+  play.py --checkpoint assets/policies/telebip_flat --num-envs 64 --duration 20
+  play.py --agent zero --task telebip_flat --duration 3                    (what the robot does without a policy)
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Parse arguments, walk, and print what was measured."""
+    options = _parse(argv)
+    checkpoint = None
+    if options.checkpoint:
+        from telebip.rl.checkpoint import load_checkpoint
+
+        checkpoint = load_checkpoint(options.checkpoint)
+        task, config, label = checkpoint.task, checkpoint.config, str(checkpoint.path)
+    else:
+        task, config, label = options.task, load_task(options.task), f"agent '{options.agent}'"
+    command = _command(options.command, config)
+    steps, config = _configure(options, config)
+    _play(options, task, config, command, steps, checkpoint, label)
+
+
+def _play(options: argparse.Namespace, task: str, config: TaskConfig, command, steps: int, checkpoint, label: str) -> None:
+    from rich.console import Console
+    from rich.progress import track
+
+    console = Console(highlight=False, soft_wrap=True)
+    with console.status("loading torch and the physics engine"):
+        import torch
+
+        from telebip.env import TelebipEnv
+        from telebip.eval.rollout import roll_out
+        from telebip.eval.walk import summarise
+        from telebip.robot import load_robot
+
+    device = resolve_device(options.device)
+    robot = load_robot(config.sim.robot)
+    env = TelebipEnv(config, robot, device, options.backend)
+    env.set_command(*command)
+    if checkpoint:
+        from telebip.rl.policy import load_policy
+
+        policy = load_policy(checkpoint, device)
+    elif options.agent == "zero":
+        policy = lambda obs: torch.zeros(env.num_envs, env.num_actions, device=device)  # noqa: E731
+    else:
+        policy = lambda obs: torch.randn(  # noqa: E731
+            env.num_envs, env.num_actions, generator=env.generator, device=device
+        )
+    _warn_untrained(console, command, checkpoint)
+
+    ticks = iter(track(range(steps), description="walking", console=console, transient=True))
+    rollout = roll_out(env, policy, steps, progress=lambda step: next(ticks, None))
+    summary = summarise(rollout, skip=min(5.0, 0.25 * options.duration))
+    console.print(f"{label}: {task}, {summary.worlds} world{'s' if summary.worlds > 1 else ''} x {summary.duration:g} s")
+    console.print(_lines(summary))
+    if options.record:
+        from telebip.viz.rerun import record
+
+        record(rollout, robot.path.with_suffix(".urdf"), Path(options.record))
+        console.print(f"recorded {options.record}; look at it with: rerun {options.record}")
+
+
+def _lines(s) -> str:
+    rows = (
+        ("command", f"{s.command[0]:.2f} m/s forward, {s.command[1]:.2f} m/s left, {s.command[2]:.2f} rad/s"),
+        ("mean speed", f"{s.speed[0]:.3f} m/s forward (spread over worlds {s.speed_spread:.3f}), {s.speed[1]:.3f} m/s left"),
+        ("tracking error", f"{s.lin_vel_error:.3f} m/s (mean of ||v_cmd - v||), yaw rate {s.yaw_rate:+.3f} rad/s"),
+        ("heading drift", f"{s.yaw_drift_deg:.1f} deg at the end"),
+        (
+            "cost of transport",
+            f"{s.cost_of_transport:.3f} mechanical, {s.cost_of_transport_article:.3f} by the article's formula",
+        ),
+        ("gait period", f"{s.gait_period:.3f} s"),
+        ("falls", f"{s.falls} (all else is measured after the first {s.skipped:g} s)"),
+    )
+    return "\n".join(f"  {name:18}{value}" for name, value in rows)
+
+
+def _command(given: Sequence[float] | None, config: TaskConfig) -> tuple[float, float, float]:
+    if given:
+        return (given[0], given[1], given[2])
+    ranges = (config.command.lin_vel_x, config.command.lin_vel_y, config.command.ang_vel_z)
+    return tuple(0.5 * (low + high) for low, high in ranges)  # type: ignore[return-value]
+
+
+def _configure(options: argparse.Namespace, config: TaskConfig) -> tuple[int, TaskConfig]:
+    """Return the number of policy steps and the task as it is played: no disturbances, no end before the duration is over."""
+    overrides = [
+        f"num_envs={options.num_envs}",
+        f"episode.length={options.duration + 1.0}",
+        "episode.reset_heading=0",
+        *(f"disturbance.{name}.enabled={str(options.disturb).lower()}" for name in ("push", "friction", "noise")),
+        *([] if options.seed is None else [f"seed={options.seed}"]),
+        *options.overrides,
+    ]
+    config = load_task(config, overrides)
+    from telebip.robot import load_robot
+
+    return max(1, round(options.duration / (config.sim.decimation * load_robot(config.sim.robot).physics_dt))), config
+
+
+def _warn_untrained(console, command: tuple[float, float, float], checkpoint) -> None:
+    """Say so if the policy never saw such a command in training."""
+    if checkpoint is None:
+        return
+    trained = checkpoint.config.command
+    names = ("forward speed", "leftward speed", "yaw rate")
+    ranges = (trained.lin_vel_x, trained.lin_vel_y, trained.ang_vel_z)
+    slack = (0.0, 0.0, trained.heading_limit if trained.heading_gain > 0 else 0.0)
+    for name, value, (low, high), extra in zip(names, command, ranges, slack, strict=True):
+        if not low - extra <= value <= high + extra:
+            console.print(f"note: {name} {value:g} lies outside what this policy was trained on, [{low:g}, {high:g}]")
+
+
+def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = Parser("Walk a policy at a given command, measure it, and record it for the rerun viewer.", EXAMPLES)
+    who = parser.add_mutually_exclusive_group()
+    who.add_argument("--checkpoint", metavar="PATH_OR_RUN", help="a checkpoint file, or a run folder for its newest")
+    who.add_argument("--agent", choices=("zero", "random"), help="no policy: nominal joint targets, or Gaussian actions")
+    parser.add_argument("--task", metavar="NAME", default="telebip_flat", help="task of an --agent (default: telebip_flat)")
+    parser.add_argument(
+        "--command",
+        nargs=3,
+        type=float,
+        metavar=("VX", "VY", "WZ"),
+        help="m/s forward, m/s left, rad/s (default: the middle of the task's ranges)",
+    )
+    parser.add_argument("--duration", type=float, default=20.0, metavar="S", help="seconds to walk (default: 20)")
+    parser.add_argument("--num-envs", metavar="N", default="1", help="worlds; they differ in their start (default: 1)")
+    parser.add_argument("--disturb", action="store_true", help="keep the task's pushes, friction and observation noise on")
+    parser.add_argument("--record", metavar="FILE.rrd", help="record the first world for the rerun viewer")
+    parser.add_argument("--seed", metavar="S", help="of the initial states (default: the task's)")
+    parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto, which prefers CUDA)")
+    parser.add_argument("--backend", default="auto", choices=("auto", "native", "warp"), help="physics engine (default: auto)")
+    parser.add_argument("overrides", nargs="*", metavar="key.path=value", help="override any field of the task")
+    options = parser.parse(argv)
+    if not (options.checkpoint or options.agent):
+        raise UserError("what should walk? --checkpoint PATH_OR_RUN (try assets/policies/telebip_flat), or --agent zero|random")
+    if not 0.0 < options.duration <= 3600.0:
+        raise UserError(f"--duration must be between 0 and 3600 s, got {options.duration:g}")
+    if options.record and Path(options.record).suffix != ".rrd":
+        raise UserError(f"--record writes FILE.rrd, got '{options.record}'")
+    return options

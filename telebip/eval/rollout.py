@@ -1,0 +1,69 @@
+"""Walk a policy and keep what happened, as plain arrays for measuring, plotting and recording."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDict
+from torch import Tensor
+
+from telebip.env import TelebipEnv
+
+Policy = Callable[[TensorDict], Tensor]
+"""Observations {"policy": (num_envs, 33)} to actions (num_envs, 6)."""
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """One row per policy step, in the order of `telebip.robot.JOINTS`. Where a world fell, its row shows its new start."""
+
+    step_dt: float  # [s]
+    weight: float  # m g of the robot [N]
+    qpos: NDArray[np.float32]  # (steps, num_envs, 13), as in SimState
+    qvel: NDArray[np.float32]  # (steps, num_envs, 12), as in SimState
+    joint_target: NDArray[np.float32]  # (steps, num_envs, 6) [rad | m]
+    joint_force: NDArray[np.float32]  # (steps, num_envs, 6), mean over the step [N m | N]
+    joint_power: NDArray[np.float32]  # (steps, num_envs, 6), mean of |force x velocity| over the step [W]
+    foot_force: NDArray[np.float32]  # (steps, num_envs, 2), right and left, mean over the step [N]
+    push_w: NDArray[np.float32]  # (steps, num_envs, 3): push on the trunk, world frame [N]
+    phase: NDArray[np.float32]  # (steps, num_envs, 2): p_r, p_l
+    command: NDArray[np.float32]  # (steps, num_envs, 3): the target command, without the heading hold [m/s, m/s, rad/s]
+    reference_heading: NDArray[np.float32]  # (steps, num_envs) [rad]
+    reward: NDArray[np.float32]  # (steps, num_envs)
+    fallen: NDArray[np.bool_]  # (steps, num_envs): the episode ended here by a fall or a fault
+
+    @property
+    def time(self) -> NDArray[np.float64]:
+        """Time of each row [s], (steps,)."""
+        return self.step_dt * np.arange(1, len(self.qpos) + 1)
+
+
+def roll_out(env: TelebipEnv, policy: Policy, steps: int, progress: Callable[[int], None] = lambda step: None) -> Rollout:
+    """Walk `policy` for `steps` policy steps from the environment's present state.
+
+    Args:
+        env: fallen worlds are reset and go on.
+        policy: what walks.
+        steps: number of policy steps.
+        progress: called with the number of finished steps.
+    """
+    rows: list[dict[str, Tensor]] = []
+    with torch.inference_mode():
+        obs = env.get_observations()
+        for step in range(steps):
+            command = env.target_command.clone()
+            obs, reward, dones, extras = env.step(policy(obs))
+            row = {
+                **{name: getattr(env.sim.state, name) for name in ("qpos", "qvel", "joint_force", "joint_power", "foot_force")},
+                "joint_target": env.joint_target,
+                "phase": env.phase,
+                "reference_heading": env.reference_heading,
+                "push_w": env.push_wrench_w[:, :3],
+            }
+            rows.append({name: value.clone() for name, value in row.items()})
+            rows[-1] |= {"command": command, "reward": reward, "fallen": dones & ~extras["time_outs"]}
+            progress(step + 1)
+    arrays = {name: torch.stack([row[name] for row in rows]).cpu().numpy() for name in rows[0]}
+    return Rollout(step_dt=env.step_dt, weight=env.robot.weight, **arrays)
