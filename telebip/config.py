@@ -207,7 +207,7 @@ def load_task(task: str | TaskConfig, overrides: Sequence[str] = ()) -> TaskConf
 
 
 def parse_config(text: str, source: str) -> TaskConfig:
-    """Rebuild a resolved configuration from `to_yaml`'s text, as checkpoints and run folders hold it; `source` names it in errors."""
+    """Rebuild a configuration from `to_yaml`'s text, as checkpoints and run folders hold it; `source` names it in errors."""
     config, origins = OmegaConf.structured(TaskConfig), {}
     _apply(config, _parse_yaml(text, source), origins)
     return _validate(config, origins, source)

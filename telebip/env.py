@@ -41,13 +41,13 @@ class TelebipEnv(VecEnv):
             device: where tensors live.
             backend: physics engine, see `telebip.sim.make_simulator`.
         """
-        self.cfg = cfg
+        self.cfg: TaskConfig = cfg
         self.robot = robot
-        self.device = torch.device(device)
+        self.device: torch.device = torch.device(device)
         self.num_envs, self.num_actions = cfg.num_envs, 6
         self.sim = make_simulator(backend, robot, self.num_envs, cfg.sim.decimation, self.device, ("geom_friction",))
         self.step_dt = cfg.sim.decimation * robot.physics_dt  # [s]
-        self.max_episode_length = max(1, round(cfg.episode.length / self.step_dt))  # policy steps
+        self.max_episode_length: int = max(1, round(cfg.episode.length / self.step_dt))  # policy steps
         self.generator = torch.Generator(self.device).manual_seed(cfg.seed)
 
         def constant(values) -> Tensor:

@@ -1,3 +1,4 @@
+# pyright: reportAttributeAccessIssue=false
 """The robot as its MJCF describes it: names, order, nominal pose and limits."""
 
 from dataclasses import dataclass
@@ -8,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telebip import ROOT
-from telebip.errors import UserError, nearest
+from telebip.errors import UserError
 
 JOINTS = ("right_hip_roll", "right_hip_pitch", "right_knee", "left_hip_roll", "left_hip_pitch", "left_knee")
 """Joints and their actuators, in the order of actions and observations: right leg first, as the phase signals (p_r, p_l)."""
@@ -54,12 +55,12 @@ def load_robot(path: str | Path) -> Robot:
         model = mujoco.MjModel.from_xml_path(str(file))
     except ValueError as error:
         raise UserError(f"{path}: {' '.join(str(error).split())}") from error
-    joints = [_id(model, mujoco.mjtObj.mjOBJ_JOINT, name, path) for name in JOINTS]
-    actuators = [_id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name, path) for name in JOINTS]
-    trunk = _id(model, mujoco.mjtObj.mjOBJ_BODY, TRUNK, path)
-    floor = _id(model, mujoco.mjtObj.mjOBJ_GEOM, FLOOR, path)
-    sensors = [_id(model, mujoco.mjtObj.mjOBJ_SENSOR, f"{foot}_force", path) for foot in FEET]
-    home = model.key(_id(model, mujoco.mjtObj.mjOBJ_KEY, KEYFRAME, path))
+    joints = [_id(model, "joint", name, path) for name in JOINTS]
+    actuators = [_id(model, "actuator", name, path) for name in JOINTS]
+    trunk = _id(model, "body", TRUNK, path)
+    floor = _id(model, "geom", FLOOR, path)
+    sensors = [_id(model, "sensor", f"{foot}_force", path) for foot in FEET]
+    home = model.key(_id(model, "key", KEYFRAME, path))
     if (model.nq, model.nv, model.nu) != (13, 12, 6) or list(model.jnt_qposadr[joints]) != list(range(7, 13)):
         raise UserError(f"{path}: expected a free joint followed by {', '.join(JOINTS)}, in this order, with one actuator each")
     if list(actuators) != list(range(6)) or list(model.actuator_trnid[:, 0]) != joints:
@@ -80,18 +81,10 @@ def load_robot(path: str | Path) -> Robot:
     )
 
 
-def _id(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str, path: str | Path) -> int:
-    index = mujoco.mj_name2id(model, kind, name)
-    if index < 0:
-        label = kind.name.removeprefix("mjOBJ_").lower()
-        count = {
-            "joint": model.njnt,
-            "actuator": model.nu,
-            "body": model.nbody,
-            "geom": model.ngeom,
-            "sensor": model.nsensor,
-            "key": model.nkey,
-        }
-        names = [mujoco.mj_id2name(model, kind, i) or "" for i in range(count[label])]
-        raise UserError(f"{path}: no {label} named '{name}'; {nearest(name, filter(None, names))}")
-    return index
+def _id(model: mujoco.MjModel, kind: str, name: str, path: str | Path) -> int:
+    """Return the id of the `kind` (joint, body, geom, actuator, sensor, key) of this name."""
+    try:
+        return getattr(model, kind)(name).id
+    except KeyError as error:  # MuJoCo lists the valid names
+        valid = str(error.args[0]).partition("Valid names: ")[2]
+        raise UserError(f"{path}: no {kind} named '{name}'; valid: {valid.strip('[]') or 'none'}") from error

@@ -4,6 +4,7 @@ import argparse
 import os
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from telebip.errors import UserError, nearest
@@ -34,7 +35,7 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Report wrong usage like every other mistake."""
-        raise UserError(f"{message} (see {os.path.basename(sys.argv[0])} --help)")
+        raise UserError(f"{message} (see {Path(sys.argv[0]).name} --help)")
 
 
 def run(command: Callable[[], None]) -> NoReturn:

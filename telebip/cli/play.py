@@ -34,7 +34,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def _play(options: argparse.Namespace, task: str, config: TaskConfig, command, steps: int, checkpoint, label: str) -> None:
     from rich.console import Console
-    from rich.progress import track
+    from rich.progress import Progress
 
     console = Console(highlight=False, soft_wrap=True)
     with console.status("loading torch and the physics engine"):
@@ -61,12 +61,18 @@ def _play(options: argparse.Namespace, task: str, config: TaskConfig, command, s
         )
     _warn_untrained(console, command, checkpoint)
 
-    ticks = iter(track(range(steps), description="walking", console=console, transient=True))
-    rollout = roll_out(env, policy, steps, progress=lambda step: next(ticks, None))
+    with Progress(console=console, transient=True) as bar:
+        walking = bar.add_task("walking", total=steps)
+        rollout = roll_out(env, policy, steps, progress=lambda step: bar.update(walking, completed=step))
     summary = summarise(rollout, skip=min(5.0, 0.25 * options.duration))
     console.print(f"{label}: {task}, {summary.worlds} world{'s' if summary.worlds > 1 else ''} x {summary.duration:g} s")
     console.print(_lines(summary))
-    if options.record:
+    if options.record and Path(options.record).suffix == ".png":
+        from telebip.viz.picture import strobe
+
+        strobe(rollout, robot, Path(options.record))
+        console.print(f"drew {options.record}")
+    elif options.record:
         from telebip.viz.rerun import record
 
         record(rollout, robot.path.with_suffix(".urdf"), Path(options.record))
@@ -141,7 +147,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--duration", type=float, default=20.0, metavar="S", help="seconds to walk (default: 20)")
     parser.add_argument("--num-envs", metavar="N", default="1", help="worlds; they differ in their start (default: 1)")
     parser.add_argument("--disturb", action="store_true", help="keep the task's pushes, friction and observation noise on")
-    parser.add_argument("--record", metavar="FILE.rrd", help="record the first world for the rerun viewer")
+    parser.add_argument("--record", metavar="FILE.rrd|FILE.png", help="record the first world for the rerun viewer, or draw it")
     parser.add_argument("--seed", metavar="S", help="of the initial states (default: the task's)")
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto, which prefers CUDA)")
     parser.add_argument("--backend", default="auto", choices=("auto", "native", "warp"), help="physics engine (default: auto)")
@@ -151,6 +157,6 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         raise UserError("what should walk? --checkpoint PATH_OR_RUN (try assets/policies/telebip_flat), or --agent zero|random")
     if not 0.0 < options.duration <= 3600.0:
         raise UserError(f"--duration must be between 0 and 3600 s, got {options.duration:g}")
-    if options.record and Path(options.record).suffix != ".rrd":
-        raise UserError(f"--record writes FILE.rrd, got '{options.record}'")
+    if options.record and Path(options.record).suffix not in (".rrd", ".png"):
+        raise UserError(f"--record writes FILE.rrd or FILE.png, got '{options.record}'")
     return options

@@ -55,7 +55,7 @@ def _train(options: argparse.Namespace, task: str, config: TaskConfig, run_dir: 
     with console.status("loading torch and the physics engine"):
         from telebip.env import TelebipEnv
         from telebip.rl.run import create_run_dir, describe_run
-        from telebip.rl.train import Progress, Trainer
+        from telebip.rl.train import Trainer
         from telebip.robot import load_robot
 
     device = resolve_device(options.device)
@@ -76,12 +76,8 @@ def _train(options: argparse.Namespace, task: str, config: TaskConfig, run_dir: 
     if trainer.iteration:
         console.print(f"resuming after iteration {trainer.iteration} of {total}")
 
-    with _stop_on_signal(console) as stop, _progress_bar(console, total, trainer.iteration) as bar:
-
-        def report(progress: Progress) -> None:
-            bar(progress, env.max_episode_length)
-
-        trainer.learn(stop, report)
+    with _stop_on_signal(console) as stop, _progress_bar(console, trainer) as show:
+        trainer.learn(stop, show)
     finished = trainer.iteration >= total
     if not finished:
         console.print(f"stopped after iteration {trainer.iteration} of {total}; go on with: train.py --resume {run_dir}")
@@ -113,7 +109,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
 
 @contextmanager
 def _stop_on_signal(console):
-    """Yield a function that tells whether the user asked to stop: once finishes the iteration and saves, twice leaves at once."""
+    """Yield a function that tells whether to stop: one Ctrl-C ends the run after its iteration, a second one at once."""
     asked = False
 
     def handle(signum: int, frame: object) -> None:
@@ -132,29 +128,32 @@ def _stop_on_signal(console):
 
 
 @contextmanager
-def _progress_bar(console, total: int, done: int):
-    """Yield a function that shows a `Progress`: a live bar on a terminal, else one line per twentieth of the run."""
+def _progress_bar(console, trainer):
+    """Yield a function that shows an iteration's scalars: a live bar on a terminal, else one line per fiftieth of the run."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     columns = (
         MofNCompleteColumn(),
-        BarColumn(bar_width=24),
+        BarColumn(bar_width=20),
         TimeElapsedColumn(),
         TextColumn("eta"),
         TimeRemainingColumn(),
         TextColumn("{task.description}"),
     )
+    total = trainer.env.cfg.ppo.max_iterations
     every = max(1, total // 50)
     with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
-        task = progress.add_task("starting", total=total, completed=done)
+        task = progress.add_task("starting", total=total, completed=trainer.iteration)
 
-        def show(p, max_length: int) -> None:
+        def show(scalars: dict[str, float]) -> None:
             text = (
-                f"{p.samples / 1e6:.2f} M samples at {p.samples_per_s / 1e3:.1f} k/s | return {p.reward:.1f} | "
-                f"length {p.episode_length:.0f}/{max_length} | error {p.lin_vel_error:.2f} m/s | {p.falls_per_minute:.1f} falls/min"
+                f"{trainer.samples / 1e6:.2f} M samples at {scalars['speed/samples_per_s'] / 1e3:.1f} k/s | "
+                f"return {scalars['train/episode_return']:.1f} | "
+                f"length {scalars['train/episode_length']:.0f}/{trainer.env.max_episode_length} | "
+                f"error {scalars['error/lin_vel_mps']:.2f} m/s | {scalars['walk/falls_per_minute']:.1f} falls/min"
             )
-            progress.update(task, completed=p.iteration, description=text)
-            if not console.is_terminal and (p.iteration % every == 0 or p.iteration == total):
-                console.print(f"{p.iteration:5d}/{total}  {text}", soft_wrap=True)
+            progress.update(task, completed=trainer.iteration, description=text)
+            if not console.is_terminal and (trainer.iteration % every == 0 or trainer.iteration == total):
+                console.print(f"{trainer.iteration:5d}/{total}  {text}", soft_wrap=True)
 
         yield show

@@ -35,7 +35,7 @@ class Rollout:
     fallen: NDArray[np.bool_]  # (steps, num_envs): the episode ended here by a fall or a fault
 
     @property
-    def time(self) -> NDArray[np.float64]:
+    def time(self) -> NDArray[np.floating]:
         """Time of each row [s], (steps,)."""
         return self.step_dt * np.arange(1, len(self.qpos) + 1)
 

@@ -14,7 +14,7 @@ def fallen(state: SimState, min_hip_height: float) -> Tensor:
 def non_finite(state: SimState) -> Tensor:
     """Whether a world's position, velocity or forces hold a NaN or an infinity: bool, (num_envs,)."""
     parts = (state.qpos, state.qvel, state.foot_force, state.joint_force, state.joint_power)
-    return ~torch.isfinite(sum(part.sum(1) for part in parts))
+    return ~torch.stack([part.sum(1) for part in parts]).isfinite().all(0)
 
 
 def timed_out(episode_length: Tensor, max_episode_length: int) -> Tensor:

@@ -9,7 +9,6 @@ import io
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -21,19 +20,6 @@ from telebip.env import TelebipEnv
 from telebip.errors import UserError
 from telebip.rl.checkpoint import Checkpoint, save_checkpoint
 from telebip.rl.policy import OBS_GROUPS, actor_cfg, critic_cfg
-
-
-@dataclass(frozen=True)
-class Progress:
-    """What a person watches, after each iteration."""
-
-    iteration: int  # finished iterations
-    samples: int
-    samples_per_s: float
-    reward: float  # mean return of recent episodes
-    episode_length: float  # their mean length, policy steps
-    lin_vel_error: float  # mean over this iteration [m/s]
-    falls_per_minute: float  # per robot
 
 
 class Trainer:
@@ -64,12 +50,12 @@ class Trainer:
             ) from error
         self.iteration, self.samples = checkpoint.iteration, checkpoint.samples
 
-    def learn(self, stop: Callable[[], bool], report: Callable[[Progress], None]) -> None:
+    def learn(self, stop: Callable[[], bool], report: Callable[[dict[str, float]], None]) -> None:
         """Train up to the configured total of iterations, or until `stop()` holds, and save a checkpoint at the end.
 
         Args:
             stop: asked after every iteration.
-            report: called after every iteration.
+            report: called after every iteration with what TensorBoard gets.
         """
         env, learner, cfg = self.env, self.learner, self.env.cfg.ppo
         writer = SummaryWriter(str(self.run_dir), purge_step=self.samples)
@@ -95,11 +81,12 @@ class Trainer:
             self.iteration += 1
             batch = env.num_envs * cfg.num_steps_per_env
             self.samples += batch
-            scalars = {
-                key: value.item() / (1 if key.startswith("fault/") else cfg.num_steps_per_env) for key, value in logs.items()
-            }
+            counts = {key: value.item() for key, value in logs.items() if key.startswith("fault/")}
+            means = {key: value.item() / cfg.num_steps_per_env for key, value in logs.items() if key not in counts}
             episode_return, episode_length = self._episodes.recent()
-            scalars |= {
+            scalars = {
+                **means,
+                **counts,
                 "train/episode_return": episode_return,
                 "train/episode_length": episode_length,
                 "train/action_std": learner.get_policy().output_std.mean().item(),
@@ -113,28 +100,16 @@ class Trainer:
                 writer.add_scalar(key, value, self.samples)
             if self.iteration % cfg.save_interval == 0:
                 self.save()
-            report(
-                Progress(
-                    self.iteration,
-                    self.samples,
-                    scalars["speed/samples_per_s"],
-                    episode_return,
-                    episode_length,
-                    scalars["error/lin_vel_mps"],
-                    scalars["walk/falls_per_minute"],
-                )
-            )
+            report(scalars)
         self.save()
         writer.close()
 
     def save(self) -> None:
-        """Write `model_<iteration>.pt`, to go on from, and `policy.pt`, the networks alone."""
+        """Write `model_<iteration>.pt`, to go on from, and `policy.pt`, the actor alone."""
         state = self.learner.save()
-        save_checkpoint(
-            self.run_dir / f"model_{self.iteration}.pt", self.task, self.env.cfg, self.iteration, self.samples, state
-        )
         actor = {"actor_state_dict": state["actor_state_dict"]}
-        save_checkpoint(self.run_dir / "policy.pt", self.task, self.env.cfg, self.iteration, self.samples, actor)
+        for name, part in ((f"model_{self.iteration}.pt", state), ("policy.pt", actor)):
+            save_checkpoint(self.run_dir / name, self.task, self.env.cfg, self.iteration, self.samples, part)
 
 
 class EpisodeStatistics:

@@ -66,7 +66,7 @@ class Simulator(Protocol):
     device: torch.device
     state: SimState
     model_fields: dict[str, Tensor]
-    """Live per-world copies of the MJCF's model fields named at construction, (num_envs, ...); writes act from the next step."""
+    """Live per-world copies of the model fields named at construction, (num_envs, ...); writes act from the next step."""
 
     def step(self, targets: Tensor, wrench_w: Tensor) -> SimState:
         """Hold joint `targets` (num_envs, 6) [rad | m] and the trunk wrench for one policy step, and return `state`.

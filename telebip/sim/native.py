@@ -1,3 +1,4 @@
+# pyright: reportAttributeAccessIssue=false
 """C MuJoCo on a thread pool: the engine of machines without a GPU, bit-identical to a loop of `mj_step`."""
 
 import copy
@@ -13,7 +14,7 @@ from telebip.sim.base import SimState
 
 
 class NativeSimulator:
-    """`Simulator` on `mujoco.batch.Batch`. States are float64 inside and float32 in `state`; results do not depend on threads."""
+    """`Simulator` on `mujoco.batch.Batch`: float64 inside, float32 in `state`; results do not depend on threads."""
 
     def __init__(
         self,

@@ -1,3 +1,4 @@
+# pyright: reportGeneralTypeIssues=false, reportIndexIssue=false, reportOperatorIssue=false
 """MuJoCo Warp: the engine of NVIDIA GPUs, one CUDA graph per policy step. It runs on the CPU too, slowly, to be tested there.
 
 The only file that imports `mujoco_warp`. Torch tensors and Warp arrays share memory in both directions.
@@ -30,7 +31,7 @@ def _accumulate(
     foot_force: wp.array2d[float],
 ):
     """Add one physics step's share, `scale` = 1 / decimation, to the means over a policy step."""
-    world, i = wp.tid()
+    world, i = wp.tid()  # type: ignore[misc]
     force = actuator_force[world, i]
     joint_force[world, i] += scale * force
     joint_power[world, i] += scale * wp.abs(force * actuator_velocity[world, i])
@@ -133,4 +134,4 @@ class WarpSimulator:
         self._launch()
         with wp.ScopedCapture(device=self._wp_device) as capture:
             self._launch()
-        return capture.graph
+        return capture.graph  # type: ignore[return-value]

@@ -77,7 +77,9 @@ def _log_robot(stream: rr.RecordingStream, robot: yourdfpy.URDF) -> None:
             )
 
 
-def _mesh(geometry: yourdfpy.urdf.Geometry) -> trimesh.Trimesh:
+def _mesh(geometry: yourdfpy.urdf.Geometry | None) -> trimesh.Trimesh:
+    if geometry is None:
+        raise UserError("a URDF visual has no geometry")
     if geometry.box is not None:
         mesh = trimesh.creation.box(extents=geometry.box.size)
     elif geometry.cylinder is not None:
@@ -93,7 +95,7 @@ def _mesh(geometry: yourdfpy.urdf.Geometry) -> trimesh.Trimesh:
 def _log_motion(stream: rr.RecordingStream, robot: yourdfpy.URDF, rollout: Rollout, world: int, time: rr.TimeColumn) -> None:
     """Log where the trunk and every link are, and the forces on them."""
     qpos, paths = rollout.qpos[:, world], link_paths(robot)
-    _log_transform(stream, paths[robot.base_link], time, qpos[:, :3], qpos[:, 3:7])
+    _log_transform(stream, paths[str(robot.base_link)], time, qpos[:, :3], qpos[:, 3:7])
     for joint in robot.robot.joints:
         origin = np.eye(4) if joint.origin is None else joint.origin
         motion = np.zeros((len(qpos), 3))
@@ -118,7 +120,7 @@ def _log_motion(stream: rr.RecordingStream, robot: yourdfpy.URDF, rollout: Rollo
     _log_arrows(stream, "world/push", time, trunk, 2.0 * FORCE_SCALE * rollout.push_w[:, world], [220, 40, 40])
 
 
-def foot_positions(robot: yourdfpy.URDF, qpos: NDArray[np.floating]) -> list[NDArray[np.floating]]:
+def foot_positions(robot: yourdfpy.URDF, qpos: NDArray[np.floating]) -> list[np.ndarray]:
     """Return the feet's centres in the world [m], one (steps, 3) array for each of `FEET`."""
     positions = [np.empty((len(qpos), 3)) for _ in FEET]
     for step, row in enumerate(qpos):
