@@ -1,6 +1,8 @@
 """`play.py`: walk a policy, measure it, and record it."""
 
 import argparse
+import os
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,6 +21,8 @@ EXAMPLES = """\
 def main(argv: Sequence[str] | None = None) -> None:
     """Parse arguments, walk, and print what was measured."""
     options = _parse(argv)
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it when it is imported
     checkpoint = None
     if options.checkpoint:
         from telebip.rl.checkpoint import load_checkpoint
@@ -28,11 +32,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     else:
         task, config, label = options.task, load_task(options.task), f"agent '{options.agent}'"
     command = _command(options.command, config)
-    steps, config = _configure(options, config)
-    _play(options, task, config, command, steps, checkpoint, label)
+    _play(options, task, _as_played(config, options), command, checkpoint, label)
 
 
-def _play(options: argparse.Namespace, task: str, config: TaskConfig, command, steps: int, checkpoint, label: str) -> None:
+def _play(options: argparse.Namespace, task: str, config: TaskConfig, command, checkpoint, label: str) -> None:
     from rich.console import Console
     from rich.progress import Progress
 
@@ -61,6 +64,7 @@ def _play(options: argparse.Namespace, task: str, config: TaskConfig, command, s
         )
     _warn_untrained(console, command, checkpoint)
 
+    steps = max(1, round(options.duration / env.step_dt))
     with Progress(console=console, transient=True) as bar:
         walking = bar.add_task("walking", total=steps)
         rollout = roll_out(env, policy, steps, progress=lambda step: bar.update(walking, completed=step))
@@ -102,8 +106,8 @@ def _command(given: Sequence[float] | None, config: TaskConfig) -> tuple[float, 
     return tuple(0.5 * (low + high) for low, high in ranges)  # type: ignore[return-value]
 
 
-def _configure(options: argparse.Namespace, config: TaskConfig) -> tuple[int, TaskConfig]:
-    """Return the number of policy steps and the task as it is played: no disturbances, no end before the duration is over."""
+def _as_played(config: TaskConfig, options: argparse.Namespace) -> TaskConfig:
+    """Return the task without disturbances, and without a time-out before the duration is over."""
     overrides = [
         f"num_envs={options.num_envs}",
         f"episode.length={options.duration + 1.0}",
@@ -112,10 +116,7 @@ def _configure(options: argparse.Namespace, config: TaskConfig) -> tuple[int, Ta
         *([] if options.seed is None else [f"seed={options.seed}"]),
         *options.overrides,
     ]
-    config = load_task(config, overrides)
-    from telebip.robot import load_robot
-
-    return max(1, round(options.duration / (config.sim.decimation * load_robot(config.sim.robot).physics_dt))), config
+    return load_task(config, overrides)
 
 
 def _warn_untrained(console, command: tuple[float, float, float], checkpoint) -> None:

@@ -64,6 +64,7 @@ class WarpSimulator:
         self.device = device
         self._decimation = decimation
         self._foot_adr = robot.foot_sensor_adr
+        wp.config.log_level = wp.LOG_WARNING  # not a line for each of a hundred kernels
         wp.init()
         self._wp_device = wp.device_from_torch(device)
         with wp.ScopedDevice(self._wp_device):
@@ -134,4 +135,5 @@ class WarpSimulator:
         self._launch()
         with wp.ScopedCapture(device=self._wp_device) as capture:
             self._launch()
+        wp.synchronize_device(self._wp_device)  # from here on everything runs on torch's stream
         return capture.graph  # type: ignore[return-value]

@@ -1,19 +1,16 @@
 # pyright: reportAttributeAccessIssue=false
 """A still picture of a walk: the robot at equal intervals, all in one scene."""
 
-import os
-import sys
+import copy
 from pathlib import Path
 
+import mujoco
 import numpy as np
 from PIL import Image
 
 from telebip.errors import UserError
 from telebip.eval.rollout import Rollout
 from telebip.robot import Robot
-
-if sys.platform == "linux" and not os.environ.get("DISPLAY"):
-    os.environ.setdefault("MUJOCO_GL", "egl")  # read when mujoco creates its first OpenGL context
 
 
 def strobe(
@@ -39,24 +36,24 @@ def strobe(
     Raises:
         UserError: there is no OpenGL to render with, or the file cannot be written.
     """
-    import mujoco
-
     stride = max(1, round(interval / rollout.step_dt))
     rows = rollout.qpos[:, world][::-1][: stride * poses : stride][::-1].astype(np.float64)
-    model, data = robot.model, mujoco.MjData(robot.model)
+    centre, along = rows[:, :3].mean(0), rows[-1, :2] - rows[0, :2]
+    span = float(np.linalg.norm(along))
+    model, data = copy.copy(robot.model), mujoco.MjData(robot.model)
     model.vis.global_.offwidth, model.vis.global_.offheight = size
+    model.stat.extent = 2.0 + 2.0 * span  # reach of the shadows
     try:
         renderer = mujoco.Renderer(model, height=size[1], width=size[0])
     except (RuntimeError, AttributeError, mujoco.FatalError) as error:
-        raise UserError(f"cannot render: no OpenGL ({error}); on Debian, install libegl1 or libosmesa6 (MUJOCO_GL=osmesa)") from error
+        raise UserError(
+            f"cannot render: no OpenGL ({error}); on Debian, install libegl1 or libosmesa6 (MUJOCO_GL=osmesa)"
+        ) from error
 
-    centre = rows[:, :3].mean(0)
-    along = rows[-1, :2] - rows[0, :2]
-    span = float(np.linalg.norm(along))
     camera = mujoco.MjvCamera()
-    camera.lookat = [*centre[:2], 0.42]
-    camera.distance = 1.3 + 0.75 * span
-    camera.azimuth = float(np.degrees(np.arctan2(along[1], along[0]))) + 112.0
+    camera.lookat = [*centre[:2], 0.4]
+    camera.distance = 1.0 + 0.5 * span
+    camera.azimuth = float(np.degrees(np.arctan2(along[1], along[0]))) + 108.0
     camera.elevation = -9.0
     option = mujoco.MjvOption()
     for i, qpos in enumerate(rows):

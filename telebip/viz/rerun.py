@@ -28,8 +28,10 @@ def record(rollout: Rollout, urdf: Path, file: Path, world: int = 0) -> None:
         world: which world.
 
     Raises:
-        UserError: the file cannot be written.
+        UserError: the file cannot be written, or the URDF is missing or has shapes a recording cannot show.
     """
+    if not urdf.is_file():
+        raise UserError(f"a recording needs the robot as URDF, but '{urdf}' does not exist")
     robot = yourdfpy.URDF.load(str(urdf))
     stream = rr.RecordingStream("telebip", recording_id=file.stem)
     try:
