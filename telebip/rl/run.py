@@ -43,7 +43,7 @@ def describe_run(run_dir: Path, config: TaskConfig, device: str, backend: str) -
         "device": device,
         "backend": backend,
         "git_revision": _git("rev-parse", "HEAD"),
-        "git_dirty": bool(_git("status", "--porcelain")),
+        "git_dirty": bool(_git("status", "--porcelain", "--untracked-files=no")),
         "python": platform.python_version(),
         "versions": {"telebip": __version__, **{name: version(name) for name in PACKAGES}},
     }
