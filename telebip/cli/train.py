@@ -142,7 +142,7 @@ def _progress_bar(console, trainer):
     )
     total = trainer.env.cfg.ppo.max_iterations
     every = max(1, total // 50)
-    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+    with Progress(*columns, console=console, disable=not console.is_terminal, speed_estimate_period=600) as progress:
         task = progress.add_task("starting", total=total, completed=trainer.iteration)
 
         def show(scalars: dict[str, float]) -> None:

@@ -34,7 +34,7 @@ def summarise(rollout: Rollout, skip: float) -> WalkSummary:
     kept = slice(min(round(skip / rollout.step_dt), len(rollout.time) - 1), None)
     velocity = heading_velocity(rollout.qpos[kept], rollout.qvel[kept])
     power = rollout.joint_power[kept].sum(-1)
-    command = rollout.command[kept].mean((0, 1))
+    command = rollout.command[kept].mean((0, 1), dtype=float)
     error = np.linalg.norm(rollout.command[kept][..., :2] - velocity, axis=-1)
     drift = _wrap(_yaw(rollout.qpos[-1, :, 3:7]) - rollout.reference_heading[-1])
     return WalkSummary(

@@ -58,7 +58,7 @@ class Trainer:
             report: called after every iteration with what TensorBoard gets.
         """
         env, learner, cfg = self.env, self.learner, self.env.cfg.ppo
-        writer = SummaryWriter(str(self.run_dir), purge_step=self.samples)
+        writer = SummaryWriter(str(self.run_dir), purge_step=self.samples + 1)
         if self.iteration == 0:  # spread the time-outs over the iterations
             ages = torch.randint(env.max_episode_length, (env.num_envs,), generator=env.generator, device=env.device)
             env.episode_length_buf = ages

@@ -177,8 +177,11 @@ def _blueprint() -> rrb.Blueprint:
             rrb.Spatial3DView(
                 name="robot",
                 origin="/world",
-                line_grid=rrb.LineGrid3D(visible=True, spacing=0.5),
-                eye_controls=rrb.EyeControls3D(tracking_entity=f"/{ROBOT}/trunk"),
+                background=[205, 215, 226],
+                line_grid=rrb.LineGrid3D(visible=True, spacing=0.5, color=[120, 130, 140]),
+                eye_controls=rrb.EyeControls3D(
+                    position=[1.2, -2.0, 0.8], look_target=[0.0, 0.0, 0.45], tracking_entity=f"/{ROBOT}/trunk"
+                ),
             ),
             rrb.Vertical(
                 plot("speed [m/s]", "speed"),
