@@ -1,0 +1,157 @@
+"""The scripts as a user runs them: exit status, the one line on standard error, and what they leave."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from telebip import ROOT
+
+TRAIN, PLAY = "scripts/train.py", "scripts/play.py"
+TINY = ("--num-envs", "8", "--device", "cpu", "ppo.num_steps_per_env=5", "ppo.hidden_dims=[16,16]")
+
+
+def run(script: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, script, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=120)
+
+
+def ran(script: str, *arguments: str) -> str:
+    """Run a script that must succeed and return what it printed."""
+    done = run(script, *arguments)
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    return done.stdout
+
+
+def refusal(script: str, *arguments: str) -> str:
+    """Run a script that must refuse its arguments and return its one line on standard error."""
+    done = run(script, *arguments)
+    assert done.returncode == 2, done.stdout + done.stderr
+    lines = done.stderr.splitlines()
+    assert len(lines) == 1, done.stderr
+    assert lines[0].startswith("error: ")
+    return lines[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        ([TRAIN, "--task", "telebip_slwo"], ["telebip_slwo", "did you mean 'telebip_slow'?"]),
+        ([TRAIN, "--task", "telebip_flat", "gait.perod=0.6"], ["gait.perod", "did you mean 'gait.period'?"]),
+        ([TRAIN, "--task", "telebip_flat", "gait.period=long"], ["gait.period=long", "'long' is not a number"]),
+        ([TRAIN, "--task", "telebip_flat", "--num-envs", "0"], ["num_envs must be >= 1", "got 0"]),
+        ([TRAIN, "--task", "telebip_flat", "--num-env", "8"], ["--num-env", "did you mean '--num-envs'?"]),
+        ([TRAIN], ["--task", "telebip_flat"]),
+        ([PLAY, "--agent", "zero", "--duration", "-1"], ["--duration", "-1"]),
+        ([PLAY, "--agent", "zero", "--record", "foo.txt"], ["--record", "foo.txt", ".rrd"]),
+    ],
+    ids=lambda value: " ".join(value[1:]) if value[0] in (TRAIN, PLAY) else "",
+)
+def test_a_mistake_is_one_line_that_names_it(arguments: list[str], named: list[str]) -> None:
+    line = refusal(*arguments)
+    for part in named:
+        assert part in line
+
+
+def test_checkpoints_that_are_missing_or_damaged(tmp_path: Path) -> None:
+    assert f"{tmp_path}/nowhere.pt" in refusal(PLAY, "--checkpoint", f"{tmp_path}/nowhere.pt")
+    damaged = tmp_path / "model_1.pt"
+    damaged.write_bytes(b"PK\x03\x04 and nothing that a zip file would hold")
+    assert str(damaged) in refusal(TRAIN, "--resume", str(damaged))
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+def test_a_gpu_that_is_not_there() -> None:
+    line = refusal(TRAIN, "--task", "telebip_flat", "--device", "cuda")
+    assert "cuda:0" in line
+    assert "this machine has: cpu" in line
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import telebip",
+        "import telebip.config; telebip.config.load_task('telebip_flat')",
+        "import runpy; sys.argv = ['train.py', '--help']; runpy.run_path('scripts/train.py', run_name='__main__')",
+    ],
+    ids=["telebip", "config", "help"],
+)
+def test_what_needs_no_engine_loads_none(code: str) -> None:
+    script = f"""
+import sys
+try:
+    {code}
+except SystemExit as stop:
+    assert not stop.code
+print(sorted({{"torch", "warp", "mujoco", "rsl_rl"}} & set(sys.modules)), file=sys.stderr)
+"""
+    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "[]\n")
+
+
+def test_help_shows_options_and_examples() -> None:
+    for script in (TRAIN, PLAY):
+        text = ran(script, "--help")
+        assert "--num-envs" in text
+        assert "examples:" in text
+
+
+@pytest.fixture(scope="module")
+def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a run of two iterations with eight worlds, made by train.py."""
+    log_dir = tmp_path_factory.mktemp("runs")
+    ran(TRAIN, "--task", "telebip_slow", "--max-iterations", "2", "--log-dir", str(log_dir), *TINY)
+    (folder,) = (log_dir / "telebip_slow").iterdir()
+    return folder
+
+
+def test_a_trained_policy_can_be_played_and_recorded(run_dir: Path) -> None:
+    assert {"model_2.pt", "policy.pt", "config.yaml", "run.json"} <= {path.name for path in run_dir.iterdir()}
+    record = run_dir / "walk.rrd"
+    text = ran(PLAY, "--checkpoint", str(run_dir), "--duration", "1", "--record", str(record), "--device", "cpu")
+    assert "telebip_slow, 1 world x 1 s" in text
+    assert "0.55 m/s forward" in text  # the middle of telebip_slow's 0.4 to 0.7
+    assert record.stat().st_size > 10_000
+
+
+def test_a_run_goes_on_in_its_folder(run_dir: Path) -> None:
+    ran(TRAIN, "--resume", str(run_dir), "--max-iterations", "3", "--device", "cpu")
+    assert (run_dir / "model_3.pt").is_file()
+    assert len(list(run_dir.parent.iterdir())) == 1
+    starts = json.loads((run_dir / "run.json").read_text())["starts"]
+    assert len(starts) == 2
+    assert "--resume" in starts[1]["command"]
+    assert "max_iterations: 3" in (run_dir / "config.yaml").read_text()
+
+
+def test_an_interrupted_run_ends_well_and_leaves_a_checkpoint(tmp_path: Path) -> None:
+    arguments = ["--task", "telebip_flat", "--max-iterations", "100000", "--log-dir", str(tmp_path), *TINY]
+    with subprocess.Popen(
+        [sys.executable, TRAIN, *arguments, "ppo.save_interval=1"],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as training:
+        try:
+            until = time.monotonic() + 60.0
+            while not list(tmp_path.glob("telebip_flat/*/model_1.pt")):
+                assert training.poll() is None
+                assert time.monotonic() < until
+                time.sleep(0.05)
+            training.send_signal(signal.SIGINT)
+            output, errors = training.communicate(timeout=60)
+        finally:
+            training.kill()
+    assert (training.returncode, errors) == (0, "")
+    stopped = next(line for line in output.splitlines() if line.startswith("stopped after iteration"))
+    iteration = int(stopped.split()[3])
+    (folder,) = (tmp_path / "telebip_flat").iterdir()
+    assert iteration >= 1
+    assert (folder / f"model_{iteration}.pt").is_file()
+    assert not (folder / f"model_{iteration + 1}.pt").exists()

@@ -1,0 +1,167 @@
+"""Checkpoints come back as they were written; whatever else a file holds is one line to the user and is never run."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from telebip.config import TaskConfig, load_task
+from telebip.errors import UserError
+from telebip.mdp.observations import LAYOUT
+from telebip.rl.checkpoint import FORMAT, load_checkpoint, save_checkpoint
+
+
+@pytest.fixture
+def config() -> TaskConfig:
+    return load_task("telebip_slow", ["num_envs=16", "gait.period=0.6"])
+
+
+def learner() -> dict[str, Any]:
+    weights = {"mlp.0.weight": torch.arange(12.0).reshape(3, 4), "std": torch.full((6,), 0.5)}
+    return {"actor_state_dict": weights, "optimizer_state_dict": {"state": {}, "param_groups": [{"lr": 2e-4}]}}
+
+
+def write(path: Path, config: TaskConfig, iteration: int = 7) -> Path:
+    save_checkpoint(path, "telebip_slow", config, iteration, 100 * iteration, learner())
+    return path
+
+
+def refusal(path: Path) -> str:
+    """Return the one line that names the path and refuses it."""
+    with pytest.raises(UserError) as caught:
+        load_checkpoint(path)
+    message = str(caught.value)
+    assert len(message.splitlines()) == 1
+    assert str(path) in message
+    return message
+
+
+def test_a_checkpoint_comes_back_as_it_was_written(tmp_path: Path, config: TaskConfig) -> None:
+    path = write(tmp_path / "model_7.pt", config)
+    loaded = load_checkpoint(path)
+    assert (loaded.path, loaded.task, loaded.iteration, loaded.samples) == (path, "telebip_slow", 7, 700)
+    assert loaded.config == config
+    assert set(loaded.learner) == {"actor_state_dict", "optimizer_state_dict"}
+    for name, weight in learner()["actor_state_dict"].items():
+        assert torch.equal(loaded.learner["actor_state_dict"][name], weight)
+    assert loaded.learner["optimizer_state_dict"] == learner()["optimizer_state_dict"]
+    assert load_checkpoint(str(path)).iteration == 7
+
+
+def test_a_folder_stands_for_its_newest_checkpoint_by_number(tmp_path: Path, config: TaskConfig) -> None:
+    for iteration in (10, 9, 2):
+        write(tmp_path / f"model_{iteration}.pt", config, iteration)
+    write(tmp_path / "policy.pt", config, 11)
+    for name in ("model_12.partial", "model_13.pt.bak", "model_best.pt"):
+        (tmp_path / name).write_bytes(b"not this one")
+    assert load_checkpoint(tmp_path).path == tmp_path / "model_10.pt"
+
+
+def test_a_folder_with_a_policy_alone_stands_for_it(tmp_path: Path, config: TaskConfig) -> None:
+    assert load_checkpoint(write(tmp_path / "policy.pt", config).parent).path == tmp_path / "policy.pt"
+
+
+def test_a_missing_path_and_an_empty_folder(tmp_path: Path) -> None:
+    assert "does not exist" in refusal(tmp_path / "model_1.pt")
+    assert "holds no checkpoint" in refusal(tmp_path)
+
+
+def test_truncated_files_are_refused(tmp_path: Path, config: TaskConfig) -> None:
+    content = write(tmp_path / "whole.pt", config).read_bytes()
+    for length in (0, 1, 10, 100, len(content) // 2, len(content) - 1):
+        path = tmp_path / f"first_{length}_bytes.pt"
+        path.write_bytes(content[:length])
+        refusal(path)
+
+
+def test_random_bytes_are_refused(tmp_path: Path) -> None:
+    for seed in range(40):
+        path = tmp_path / f"random_{seed}.pt"
+        path.write_bytes(np.random.default_rng(seed).bytes(1 + 50 * seed))
+        refusal(path)
+
+
+def test_scribbled_files_are_refused_or_still_whole(tmp_path: Path, config: TaskConfig) -> None:
+    content = write(tmp_path / "whole.pt", config).read_bytes()
+    random = np.random.default_rng(0)
+    for i in range(40):
+        damaged = bytearray(content)
+        start = int(random.integers(len(content) - 64))
+        damaged[start : start + 64] = random.bytes(64)
+        path = tmp_path / f"scribbled_{i}.pt"
+        path.write_bytes(bytes(damaged))
+        try:
+            assert load_checkpoint(path).iteration == 7
+        except UserError as error:
+            assert len(str(error).splitlines()) == 1
+            assert str(path) in str(error)
+
+
+class RunsCode:
+    """Unpickling an object of this class creates a file."""
+
+    def __init__(self, marker: Path) -> None:
+        self.marker = marker
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (Path.touch, (self.marker,))
+
+
+def test_a_pickle_that_would_run_code_is_refused_and_not_run(tmp_path: Path) -> None:
+    marker, path = tmp_path / "marker", tmp_path / "model_1.pt"
+    torch.save({"format": FORMAT, "payload": RunsCode(marker)}, path)
+    assert "more than data" in refusal(path)
+    assert not marker.exists()
+    torch.load(path, weights_only=False)
+    assert marker.exists()  # it would have
+
+
+@pytest.mark.parametrize(
+    "content", [{"model_state_dict": {}, "iter": 3}, [1, 2, 3], torch.zeros(3)], ids=["dict", "list", "tensor"]
+)
+def test_a_foreign_file_is_refused(tmp_path: Path, content: Any) -> None:
+    torch.save(content, tmp_path / "foreign.pt")
+    assert "is not a telebip checkpoint" in refusal(tmp_path / "foreign.pt")
+
+
+def edited(path: Path, config: TaskConfig, changes: dict[str, Any]) -> Path:
+    """Write a checkpoint with some of its entries replaced, or dropped where the change is None."""
+    content = torch.load(write(path, config), weights_only=True) | changes
+    torch.save({key: value for key, value in content.items() if value is not None}, path)
+    return path
+
+
+def test_another_format_is_refused(tmp_path: Path, config: TaskConfig) -> None:
+    message = refusal(edited(tmp_path / "model_1.pt", config, {"format": "telebip-checkpoint-9"}))
+    assert "telebip-checkpoint-9" in message
+    assert FORMAT in message
+
+
+@pytest.mark.parametrize(
+    ("part", "layout"),
+    [("observation", {**LAYOUT, "phase": 3}), ("action", ["left_knee", "right_knee"])],
+)
+def test_another_layout_is_refused(tmp_path: Path, config: TaskConfig, part: str, layout: Any) -> None:
+    message = refusal(edited(tmp_path / "model_1.pt", config, {part: layout}))
+    assert f"{part} layout" in message
+
+
+@pytest.mark.parametrize("entry", ["task", "config", "observation", "action", "iteration", "samples"])
+def test_a_missing_entry_is_refused(tmp_path: Path, config: TaskConfig, entry: str) -> None:
+    refusal(edited(tmp_path / "model_1.pt", config, {entry: None}))
+
+
+def test_a_configuration_of_another_version_is_refused(tmp_path: Path, config: TaskConfig) -> None:
+    message = refusal(edited(tmp_path / "model_1.pt", config, {"config": "gait: {perod: 0.5}\n"}))
+    assert "gait.period" in message
+
+
+def test_interrupted_writing_leaves_the_older_file(tmp_path: Path, config: TaskConfig) -> None:
+    path = write(tmp_path / "model_7.pt", config)
+    before = path.read_bytes()
+    with pytest.raises(Exception, match=r"pickle|local|lambda"):  # breaks off amidst the writing
+        save_checkpoint(path, "telebip_slow", config, 8, 800, {"weights": torch.zeros(9), "bad": lambda: None})
+    assert path.read_bytes() == before
+    assert load_checkpoint(tmp_path).iteration == 7

@@ -1,0 +1,125 @@
+"""Training in real worlds: what a run leaves, how it goes on, and that it can be repeated."""
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from telebip.config import load_task
+from telebip.env import TelebipEnv
+from telebip.errors import UserError
+from telebip.rl.checkpoint import load_checkpoint
+from telebip.rl.policy import load_policy
+from telebip.rl.train import EpisodeStatistics, Trainer
+from telebip.robot import Robot
+
+SMALL = ("num_envs=8", "ppo.num_steps_per_env=10", "ppo.hidden_dims=[16,16]", "episode.length=0.2")
+
+
+def trainer(robot: Robot, run_dir: Path, iterations: int, *overrides: str) -> Trainer:
+    config = load_task("telebip_flat", [*SMALL, f"ppo.max_iterations={iterations}", *overrides])
+    return Trainer(TelebipEnv(config, robot, "cpu", "native"), "telebip_flat", run_dir)
+
+
+def train(robot: Robot, run_dir: Path, iterations: int, *overrides: str) -> Trainer:
+    done = trainer(robot, run_dir, iterations, *overrides)
+    done.learn(stop=lambda: False, report=lambda scalars: None)
+    return done
+
+
+def scalars(run_dir: Path) -> dict[str, list[tuple[int, float]]]:
+    """Return what TensorBoard shows: (samples, value) for each name."""
+    events = EventAccumulator(str(run_dir))
+    events.Reload()
+    return {tag: [(event.step, event.value) for event in events.Scalars(tag)] for tag in events.Tags()["scalars"]}
+
+
+def test_a_run_leaves_checkpoints_and_curves_and_goes_on(robot: Robot, tmp_path: Path) -> None:
+    first = train(robot, tmp_path, 2)
+    assert (first.iteration, first.samples) == (2, 2 * 8 * 10)
+    assert {path.name for path in tmp_path.glob("*.pt")} == {"model_2.pt", "policy.pt"}
+    curves = scalars(tmp_path)
+    assert set(curves) >= {
+        *(f"reward/{name}" for name in ("cmd", "diff", "tq", "foot", "termination")),
+        *("error/lin_vel_mps", "error/yaw_rate_radps", "walk/cost_of_transport", "walk/falls_per_minute"),
+        *("fault/non_finite_worlds", "train/episode_return", "train/episode_length", "train/action_std"),
+        *("train/learning_rate", "loss/value", "loss/surrogate", "speed/samples_per_s"),
+    }
+    for name, curve in curves.items():
+        assert [samples for samples, _ in curve] == [80, 160], name
+        assert all(math.isfinite(value) for _, value in curve), name
+    assert [value for _, value in curves["fault/non_finite_worlds"]] == [0.0, 0.0]
+    assert 0.0 < curves["reward/cmd"][0][1] <= 0.35  # k_xy + k_w
+    assert curves["reward/diff"][0][1] < 0.0
+
+    checkpoint = load_checkpoint(tmp_path)
+    second = trainer(robot, tmp_path, 4)
+    second.resume(checkpoint)
+    assert (second.iteration, second.samples) == (2, 160)
+    for name, weight in first.learner.get_policy().state_dict().items():
+        assert torch.equal(second.learner.get_policy().state_dict()[name], weight)
+    moments = second.learner.optimizer.state_dict()["state"]
+    assert moments[0]["step"] == first.learner.optimizer.state_dict()["state"][0]["step"] > 0
+    second.learn(stop=lambda: False, report=lambda scalars: None)
+    assert (second.iteration, second.samples) == (4, 320)
+    assert {path.name for path in tmp_path.glob("*.pt")} == {"model_2.pt", "model_4.pt", "policy.pt"}
+    assert [samples for samples, _ in scalars(tmp_path)["reward/cmd"]] == [80, 160, 240, 320]
+    assert load_checkpoint(tmp_path / "policy.pt").iteration == 4
+
+
+def test_the_written_policy_acts_as_the_learner(robot: Robot, tmp_path: Path) -> None:
+    done = train(robot, tmp_path, 2)
+    actor = done.learner.get_policy().eval()
+    obs = done.env.get_observations()
+    with torch.inference_mode():
+        expected = actor(obs)
+        for name in ("policy.pt", "model_2.pt"):
+            policy = load_policy(load_checkpoint(tmp_path / name), "cpu")
+            assert torch.equal(policy(obs), expected)
+            assert torch.equal(policy(obs), policy(obs))
+    assert expected.abs().max() > 0.0
+    assert set(load_checkpoint(tmp_path / "policy.pt").learner) == {"actor_state_dict"}
+
+
+def test_the_same_seed_gives_the_same_weights_bit_for_bit(robot: Robot, tmp_path: Path) -> None:
+    runs = [("a", "seed=1"), ("b", "seed=1"), ("c", "seed=2")]
+    a, b, c = (train(robot, tmp_path / name, 2, seed).learner.get_policy().state_dict() for name, seed in runs)
+    assert all(torch.equal(a[name], b[name]) for name in a)
+    assert not all(torch.equal(a[name], c[name]) for name in a)
+
+
+def test_stopping_saves_what_was_learned(robot: Robot, tmp_path: Path) -> None:
+    stopped = trainer(robot, tmp_path, 1000)
+    stopped.learn(stop=lambda: stopped.iteration == 1, report=lambda scalars: None)
+    assert load_checkpoint(tmp_path).iteration == 1
+
+
+def test_a_checkpoint_of_other_networks_is_refused_in_one_line(robot: Robot, tmp_path: Path) -> None:
+    train(robot, tmp_path, 1)
+    checkpoint = load_checkpoint(tmp_path)
+    with pytest.raises(UserError, match=r"^checkpoint '.*model_1.pt' cannot be resumed: [^\n]*$"):
+        trainer(robot, tmp_path, 2, "ppo.hidden_dims=[8]").resume(checkpoint)
+
+
+def test_more_mini_batches_than_samples_are_refused(robot: Robot, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"ppo.num_mini_batches is 81, but an iteration has only 8 worlds x 10 steps"):
+        trainer(robot, tmp_path, 1, "ppo.num_mini_batches=81")
+
+
+def test_episode_statistics_by_hand() -> None:
+    statistics = EpisodeStatistics(2, torch.device("cpu"), min_episodes=2)
+    assert all(math.isnan(value) for value in statistics.recent())
+    for rewards, dones in (([1.0, 10.0], [False, False]), ([2.0, 20.0], [True, False]), ([4.0, 40.0], [False, True])):
+        statistics.add(torch.tensor(rewards), torch.tensor(dones))
+    # World 0 ended with 1 + 2 after 2 steps, world 1 with 10 + 20 + 40 after 3.
+    assert statistics.recent() == (36.5, 2.5)
+    statistics.add(torch.tensor([8.0, 80.0]), torch.tensor([True, False]))
+    # World 0 ended with 4 + 8 after 2 steps; one episode is too few, so that the two before still count.
+    assert statistics.recent() == pytest.approx(((3 + 70 + 12) / 3, 7 / 3))
+    statistics.add(torch.tensor([5.0, 1.0]), torch.tensor([True, True]))
+    # World 0 ended with 5 after 1 step, world 1 with 80 + 1 after 2: two episodes are enough, the older ones are dropped.
+    assert statistics.recent() == (43.0, 1.5)
+    statistics.add(torch.tensor([1.0, 1.0]), torch.tensor([False, False]))
+    assert statistics.recent() == (43.0, 1.5)

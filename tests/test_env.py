@@ -1,0 +1,455 @@
+# pyright: reportAttributeAccessIssue=false
+"""The environment: the order of one step, its invariances, and what it promises to a learner."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from rsl_rl.env import VecEnv
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from telebip.env import TelebipEnv
+from telebip.math import quat_from_yaw, quat_mul, wrap_angle
+from telebip.robot import Robot
+
+MakeEnv = Callable[..., TelebipEnv]
+
+NEVER_FALL = "episode.min_hip_height=0"
+PHASE, LAST_ACTION = slice(31, 33), slice(12, 18)
+
+
+def random_actions(steps: int, num_envs: int, scale: float = 1.0, seed: int = 0) -> Tensor:
+    return scale * torch.randn(steps, num_envs, 6, generator=torch.Generator().manual_seed(seed))
+
+
+def observe(env: TelebipEnv) -> Tensor:
+    return env.get_observations()["policy"]
+
+
+def put(env: TelebipEnv, worlds: list[int], qpos: Tensor, qvel: Tensor) -> None:
+    """Put the listed worlds into rows of `qpos` and `qvel`."""
+    mask = torch.zeros(env.num_envs, dtype=torch.bool)
+    mask[worlds] = True
+    env.sim.reset(mask, qpos, qvel)
+
+
+def put_low(env: TelebipEnv, worlds: list[int]) -> None:
+    """Put the hips of the listed worlds at 0.3 m, below the 0.4 m that count as a fall."""
+    qpos = env.sim.state.qpos.clone()
+    qpos[:, 2] = 0.3
+    put(env, worlds, qpos, torch.zeros(env.num_envs, 12))
+
+
+@pytest.mark.parametrize("num_envs", [1, 4])
+def test_it_is_an_rsl_rl_vec_env(make_env: MakeEnv, num_envs: int) -> None:
+    env = make_env(num_envs=num_envs)
+    assert isinstance(env, VecEnv)
+    assert (env.num_envs, env.num_actions, env.max_episode_length) == (num_envs, 6, 500)  # 10 s at 50 Hz
+    assert env.step_dt == pytest.approx(0.02)
+    for obs, rewards, dones, extras in (env.step(torch.zeros(num_envs, 6)) for _ in range(2)):
+        assert obs.batch_size == (num_envs,)
+        assert (obs["policy"].shape, obs["policy"].dtype) == ((num_envs, 33), torch.float32)
+        assert (rewards.shape, rewards.dtype) == ((num_envs,), torch.float32)
+        assert (dones.shape, dones.dtype) == ((num_envs,), torch.bool)
+        assert (extras["time_outs"].shape, extras["time_outs"].dtype) == ((num_envs,), torch.bool)
+        assert {value.shape for value in extras["log"].values()} == {()}
+    assert env.episode_length_buf.tolist() == [2] * num_envs
+
+
+@pytest.mark.parametrize("shape", [(4, 5), (3, 6), (6,), (4, 6, 1)])
+def test_actions_of_another_shape_are_refused(make_env: MakeEnv, shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"\(4, 6\)"):
+        make_env().step(torch.zeros(shape))
+
+
+def test_observation_order(make_env: MakeEnv, robot: Robot) -> None:
+    env = make_env("command.heading_gain=0.5", "command.heading_limit=0.2", calm=True)
+    env.set_command(0.6, 0.1, 0.3)
+    actions = random_actions(5, 4, 0.3)
+    for action in actions:
+        obs = env.step(action)[0]["policy"].double().numpy()
+    qpos, qvel = env.sim.state.qpos.double().numpy(), env.sim.state.qvel.double().numpy()
+    for world in range(4):
+        quat, inverse, lin_vel_b = qpos[world, 3:7], np.empty(4), np.empty(3)
+        mujoco.mju_negQuat(inverse, quat)
+        mujoco.mju_rotVecQuat(lin_vel_b, qvel[world, :3], inverse)
+        reference, relative = float(env.reference_heading[world]), np.empty(4)
+        mujoco.mju_mulQuat(relative, np.array([math.cos(reference / 2), 0, 0, -math.sin(reference / 2)]), quat)
+        rotation = np.empty(9)
+        mujoco.mju_quat2Mat(rotation, quat)
+        correction = np.clip(0.5 * _wrapped(reference - math.atan2(rotation[3], rotation[0])), -0.2, 0.2)
+        phase = math.sin(2 * math.pi * 0.1 / 0.5)  # five steps of 0.02 s, a period of 0.5 s
+        expected = np.concatenate(
+            [
+                qpos[world, 7:] - robot.nominal,
+                qvel[world, 6:],
+                actions[-1, world].numpy(),
+                lin_vel_b,
+                qvel[world, 3:6],
+                relative * np.sign(relative[0]),
+                [0.6, 0.1, 0.3 + correction],
+                [phase, -phase],
+            ]
+        )
+        np.testing.assert_allclose(obs[world], expected, atol=2e-6)
+
+
+def _wrapped(angle: float) -> float:
+    return math.remainder(angle, 2 * math.pi)
+
+
+def test_the_reference_heading_starts_at_the_robots_and_turns_with_the_command(make_env: MakeEnv) -> None:
+    env = make_env(calm=True)
+    env.set_command(0.5, 0.0, 0.4)
+    w, _, _, z = env.sim.state.base_quat.unbind(1)
+    start = 2.0 * torch.atan2(z, w)
+    assert (wrap_angle(start)[:, None] - wrap_angle(start)).abs().max() > 0.5  # they face different ways
+    torch.testing.assert_close(env.reference_heading, wrap_angle(start), atol=1e-5, rtol=0.0)
+    for _ in range(10):
+        env.step(torch.zeros(4, 6))
+    torch.testing.assert_close(wrap_angle(env.reference_heading - start), torch.full((4,), 0.4 * 0.2), atol=1e-5, rtol=0.0)
+
+
+def test_the_end_of_the_episode_is_a_time_out_and_not_a_termination(make_env: MakeEnv) -> None:
+    env = make_env("episode.length=0.1", "episode.reset_joint_pos=0")
+    for step in range(1, 11):
+        _, _, dones, extras = env.step(torch.zeros(4, 6))
+        assert dones.tolist() == extras["time_outs"].tolist() == [step % 5 == 0] * 4
+        assert extras["log"]["reward/termination"] == 0.0
+        assert extras["log"]["walk/falls_per_minute"] == 0.0
+
+
+def test_a_fall_is_a_termination_and_not_a_time_out_even_at_the_end(make_env: MakeEnv) -> None:
+    env = make_env("episode.length=0.1", calm=True)
+    for step in range(1, 6):
+        if step in (2, 5):
+            put_low(env, [1])
+        _, _, dones, extras = env.step(torch.zeros(4, 6))
+        fell = [step in (2, 5) and world == 1 for world in range(4)]
+        late = [step == 5 and world != 1 for world in range(4)]
+        assert (dones & ~extras["time_outs"]).tolist() == fell
+        assert extras["time_outs"].tolist() == late
+        assert extras["log"]["reward/termination"].item() == -0.25 * any(fell)
+        if step == 2:
+            env.episode_length_buf[1] = 2  # so that its episode, too, would end at step 5
+
+
+def test_the_reward_is_the_sum_of_its_terms(make_env: MakeEnv) -> None:
+    env = make_env(num_envs=8)
+    seen: set[str] = set()
+    for step, action in enumerate(random_actions(20, 8)):
+        if step == 10:
+            put_low(env, [0])
+        _, rewards, _, extras = env.step(action)
+        terms = {key: value for key, value in extras["log"].items() if key.startswith("reward/")}
+        assert set(terms) == {"reward/cmd", "reward/diff", "reward/tq", "reward/foot", "reward/termination"}
+        torch.testing.assert_close(rewards.mean(), torch.stack(list(terms.values())).sum(), atol=1e-6, rtol=0.0)
+        seen |= {key for key, value in terms.items() if value != 0.0}
+    assert seen == set(terms)
+
+
+def test_the_observation_after_a_reset_belongs_to_the_new_episode(make_env: MakeEnv) -> None:
+    env = make_env(calm=True)
+    for action in random_actions(3, 4, 0.3):
+        env.step(action)
+    put_low(env, [0, 2])
+    action = torch.ones(4, 6)
+    obs = env.step(action)[0]["policy"]
+    assert env.episode_length_buf.tolist() == [0, 4, 0, 4]
+    for world in (0, 2):
+        assert obs[world, LAST_ACTION].tolist() == [0.0] * 6
+        assert obs[world, PHASE].tolist() == [0.0, 0.0]
+        assert obs[world, :6].abs().max() <= 0.02 + 1e-6  # episode.reset_joint_pos
+        assert env.sim.state.qpos[world, 2] > 0.6
+        assert not env._foot_window[world].any()
+        torch.testing.assert_close(obs[world, 24:28], torch.tensor([1.0, 0.0, 0.0, 0.0]), atol=1e-6, rtol=0.0)
+    for world in (1, 3):
+        assert obs[world, LAST_ACTION].tolist() == [1.0] * 6
+        assert obs[world, PHASE.start] == pytest.approx(math.sin(2 * math.pi * 0.08 / 0.5))
+
+
+def turned(env: TelebipEnv, angle: float) -> tuple[Tensor, Tensor]:
+    """Return the state turned about the world's z axis; the angular velocity is in the body frame and stays."""
+    qpos, qvel = env.sim.state.qpos.clone(), env.sim.state.qvel.clone()
+    c, s = math.cos(angle), math.sin(angle)
+    rotation = torch.tensor([[c, -s], [s, c]])
+    qpos[:, :2], qvel[:, :2] = qpos[:, :2] @ rotation.T, qvel[:, :2] @ rotation.T
+    qpos[:, 3:7] = quat_mul(quat_from_yaw(torch.full((env.num_envs,), angle)), qpos[:, 3:7])
+    return qpos, qvel
+
+
+@pytest.mark.parametrize("height", [0.0, 2.0], ids=["on the ground", "in the air"])
+@pytest.mark.parametrize("angle", [math.pi / 2, 2.0])
+def test_a_turned_world_looks_the_same(make_env: MakeEnv, angle: float, height: float) -> None:
+    a, b = (make_env("episode.reset_heading=0", calm=True, num_envs=8) for _ in range(2))
+    for env, by in ((a, 0.0), (b, angle)):
+        qpos, qvel = turned(env, by)
+        qpos[:, 2] += height
+        put(env, list(range(8)), qpos, qvel)
+        env.reference_heading.copy_(wrap_angle(env.reference_heading + by))
+    torch.testing.assert_close(observe(b), observe(a), atol=1e-5, rtol=0.0)
+    for action in random_actions(20, 8, 0.3):
+        obs_a, rewards_a, dones_a, _ = a.step(action)
+        obs_b, rewards_b, dones_b, _ = b.step(action)
+        assert not dones_a.any()
+        assert not dones_b.any()
+        torch.testing.assert_close(obs_b["policy"], obs_a["policy"], atol=1e-4, rtol=0.0)
+        torch.testing.assert_close(rewards_b, rewards_a, atol=1e-4, rtol=0.0)
+
+
+SWAP = [3, 4, 5, 0, 1, 2]  # right leg <-> left leg
+JOINT_SIGN = torch.tensor([-1.0, 1.0, 1.0] * 2)  # a roll to the right becomes one to the left
+POLAR, AXIAL = torch.tensor([1.0, -1.0, 1.0]), torch.tensor([-1.0, 1.0, -1.0])  # vectors and rotations at the plane y = 0
+
+
+def mirrored_joints(joints: Tensor) -> Tensor:
+    return joints[:, SWAP] * JOINT_SIGN
+
+
+def mirrored_quat(quat: Tensor) -> Tensor:
+    return torch.cat([quat[:, :1], quat[:, 1:] * AXIAL], dim=1)
+
+
+def mirrored_state(qpos: Tensor, qvel: Tensor) -> tuple[Tensor, Tensor]:
+    return (
+        torch.cat([qpos[:, :3] * POLAR, mirrored_quat(qpos[:, 3:7]), mirrored_joints(qpos[:, 7:])], dim=1),
+        torch.cat([qvel[:, :3] * POLAR, qvel[:, 3:6] * AXIAL, mirrored_joints(qvel[:, 6:])], dim=1),
+    )
+
+
+def mirrored_observation(obs: Tensor) -> Tensor:
+    joints = [mirrored_joints(obs[:, i : i + 6]) for i in (0, 6, 12)]
+    command = obs[:, 28:31] * torch.tensor([1.0, -1.0, -1.0])
+    base = [obs[:, 18:21] * POLAR, obs[:, 21:24] * AXIAL, mirrored_quat(obs[:, 24:28])]
+    return torch.cat([*joints, *base, command, obs[:, 31:33].flip(1)], dim=1)
+
+
+def test_a_mirrored_world_moves_mirrored_half_a_period_later(make_env: MakeEnv) -> None:
+    overrides = ("gait.period=0.48", "episode.reset_heading=0.5")  # half a period is 12 steps
+    a, b = (make_env(*overrides, calm=True, num_envs=8) for _ in range(2))
+    a.set_command(0.6, 0.1, 0.2)
+    b.set_command(0.6, -0.1, -0.2)
+    put(b, list(range(8)), *mirrored_state(a.sim.state.qpos, a.sim.state.qvel))
+    b.reference_heading.copy_(-a.reference_heading)
+    b.episode_length_buf += 12
+    for action in random_actions(20, 8, 0.3):
+        obs_a, rewards_a, dones_a, _ = a.step(action)
+        obs_b, rewards_b, dones_b, _ = b.step(mirrored_joints(action))
+        assert not dones_a.any()
+        assert not dones_b.any()
+        torch.testing.assert_close(obs_b["policy"], mirrored_observation(obs_a["policy"]), atol=1e-4, rtol=0.0)
+        torch.testing.assert_close(rewards_b, rewards_a, atol=1e-4, rtol=0.0)
+        qpos, qvel = mirrored_state(a.sim.state.qpos, a.sim.state.qvel)
+        torch.testing.assert_close(b.sim.state.qpos, qpos, atol=1e-4, rtol=0.0)
+        torch.testing.assert_close(b.sim.state.qvel, qvel, atol=1e-3, rtol=0.0)
+
+
+def test_commands_are_drawn_anew_after_the_resampling_time_and_only_then(make_env: MakeEnv) -> None:
+    ranges = ("command.lin_vel_x=[0.4,1.0]", "command.lin_vel_y=[-0.2,0.2]", "command.ang_vel_z=[-0.5,0.5]")
+    env = make_env("command.resampling_time=0.2", NEVER_FALL, *ranges, calm=True)
+    low, high = torch.tensor([0.4, -0.2, -0.5]), torch.tensor([1.0, 0.2, 0.5])
+    last = env.target_command.clone()
+    for step in range(1, 41):
+        env.step(torch.zeros(4, 6))
+        changed = (env.target_command != last).all(dim=1)
+        assert changed.tolist() == [step % 10 == 0] * 4
+        assert ((low <= env.target_command) & (env.target_command <= high)).all()
+        last = env.target_command.clone()
+
+
+def test_a_new_episode_gets_a_new_command(make_env: MakeEnv) -> None:
+    env = make_env(calm=True)
+    last = env.target_command.clone()
+    put_low(env, [2])
+    env.step(torch.zeros(4, 6))
+    assert (env.target_command != last).any(dim=1).tolist() == [False, False, True, False]
+
+
+def test_a_set_command_stays_through_resets_and_resampling(make_env: MakeEnv) -> None:
+    env = make_env("episode.length=0.1", "command.resampling_time=0.06", "command.heading_gain=0", calm=True)
+    env.set_command(0.3, -0.1, 0.2)
+    command = torch.tensor([[0.3, -0.1, 0.2]]).expand(4, -1)
+    assert torch.equal(observe(env)[:, 28:31], command)
+    dones = torch.zeros(4, dtype=torch.bool)
+    for _ in range(12):
+        obs, _, done, _ = env.step(torch.zeros(4, 6))
+        dones |= done
+        assert torch.equal(obs["policy"][:, 28:31], command)
+    env.reset()
+    assert dones.all()
+    assert torch.equal(observe(env)[:, 28:31], command)
+
+
+def test_pushes_last_their_duration_and_come_at_their_interval(make_env: MakeEnv) -> None:
+    push = ("force=40", "duration=0.1", "interval=[0.4,0.4]")
+    env = make_env(*(f"disturbance.push.{setting}" for setting in push), NEVER_FALL)
+    wrenches = []
+    for _ in range(120):
+        env.step(torch.zeros(4, 6))
+        wrenches.append(env.push_wrench_w.clone())
+    wrench = torch.stack(wrenches)
+    assert not wrench[:, :, 2:].any()  # horizontal, at the centre of mass
+    assert 1.0 < torch.linalg.vector_norm(wrench[..., :2], dim=-1).max() <= 40.0
+    for world in range(4):
+        active = wrench[:, world].any(dim=1).int()
+        edges = torch.diff(active, prepend=torch.zeros(1, dtype=torch.int32))
+        starts, ends = torch.nonzero(edges == 1)[:, 0], torch.nonzero(edges == -1)[:, 0]
+        assert len(starts) >= 5
+        assert set((ends - starts[: len(ends)]).tolist()) == {5}  # 0.1 s
+        assert set(torch.diff(starts).tolist()) <= {20, 21}  # 0.4 s
+        assert 20 <= starts[0] <= 21
+        for start in starts[:-1]:
+            assert torch.equal(wrench[start, world], wrench[start + 4, world])
+
+
+def test_a_push_moves_the_robot_along_it(make_env: MakeEnv) -> None:
+    push = [f"disturbance.push.{setting}" for setting in ("force=50", "duration=0.1", "interval=[0.06,0.06]")]
+    off = [f"disturbance.{name}.enabled=false" for name in ("friction", "noise")]
+    pushed, calm = make_env(*push, *off), make_env(calm=True)
+    qpos = pushed.sim.state.qpos.clone()
+    qpos[:, 2] = 3.0  # in the air, where nothing else pushes
+    for env in (pushed, calm):
+        put(env, list(range(4)), qpos, torch.zeros(4, 12))
+    steps = 0
+    while not pushed.push_wrench_w.any():
+        assert torch.equal(pushed.sim.state.qvel, calm.sim.state.qvel)
+        for env in (pushed, calm):
+            env.step(torch.zeros(4, 6))
+        steps += 1
+        assert steps < 10
+    difference = (pushed.sim.state.qvel - calm.sim.state.qvel)[:, :2]
+    direction = torch.nn.functional.cosine_similarity(difference, pushed.push_wrench_w[:, :2])
+    assert direction.min() > 0.9
+
+
+def test_switched_off_disturbances_are_exactly_absent(make_env: MakeEnv, robot: Robot) -> None:
+    env = make_env("episode.length=0.2", "disturbance.push.interval=[0.02,0.02]", calm=True)
+    friction = env.sim.model_fields["geom_friction"]
+    for action in random_actions(30, 4):
+        env.step(action)
+        assert not env.push_wrench_w.any()
+        assert torch.equal(observe(env), observe(env))
+    expected = torch.as_tensor(robot.model.geom_friction).to(friction).expand_as(friction)
+    assert torch.equal(friction, expected)
+
+
+def test_noise_is_bounded_fresh_and_leaves_what_the_policy_knows(make_env: MakeEnv) -> None:
+    env = make_env("disturbance.push.enabled=false", num_envs=16)
+    env.step(torch.ones(16, 6))
+    draws = torch.stack([observe(env) for _ in range(50)])
+    amplitude = torch.cat(
+        [torch.full((n,), a) for n, a in ((6, 0.005), (6, 0.1), (6, 0.0), (3, 0.05), (3, 0.1), (4, 0.01), (5, 0.0))]
+    )
+    spread = draws.amax(dim=(0)) - draws.amin(dim=0)
+    assert (spread <= 2.0 * amplitude + 1e-6).all()
+    assert (spread >= 1.5 * amplitude).all()  # of 50 uniform draws, the range is below three quarters once in 10^5
+    assert torch.equal(spread[:, amplitude == 0.0], torch.zeros(16, 11))
+
+
+def test_noise_does_not_reach_the_rewards(make_env: MakeEnv) -> None:
+    off = [f"disturbance.{name}.enabled=false" for name in ("push", "friction")]
+    noisy, calm = make_env(*off), make_env(calm=True)
+    put(noisy, list(range(4)), calm.sim.state.qpos, calm.sim.state.qvel)
+    noisy.reference_heading.copy_(calm.reference_heading)
+    for env in (noisy, calm):
+        env.set_command(0.5, 0.0, 0.0)
+    for action in random_actions(5, 4, 0.3):
+        assert torch.equal(noisy.step(action)[1], calm.step(action)[1])
+
+
+def test_friction_is_drawn_per_world_and_episode(make_env: MakeEnv, robot: Robot) -> None:
+    env = make_env("disturbance.friction.range=[0.3,0.9]", num_envs=8)
+    friction = env.sim.model_fields["geom_friction"][:, robot.floor_id, 0]
+    first = friction.clone()
+    assert len(first.unique()) == 8
+    assert ((first >= 0.3) & (first <= 0.9)).all()
+    put_low(env, [4])
+    env.step(torch.zeros(8, 6))
+    assert (friction != first).tolist() == [world == 4 for world in range(8)]
+
+
+def test_a_fault_is_counted_reset_and_stays_in_its_world(make_env: MakeEnv) -> None:
+    healthy, faulty = (make_env("disturbance.push.interval=[0.1,0.3]", num_envs=8) for _ in range(2))
+    others = [0, 1, 2, 4, 5, 6, 7]
+    for step, action in enumerate(random_actions(20, 8, 0.5)):
+        if step == 6:
+            qpos = faulty.sim.state.qpos.clone()
+            qpos[3, 8] = float("nan")
+            put(faulty, [3], qpos, faulty.sim.state.qvel.clone())
+        obs, rewards, dones, extras = faulty.step(action)
+        expected_obs, expected_rewards, expected_dones, expected_extras = healthy.step(action)
+        assert extras["log"]["fault/non_finite_worlds"].item() == (1 if step == 6 else 0)
+        assert expected_extras["log"]["fault/non_finite_worlds"].item() == 0
+        if step == 6:
+            assert dones[3]
+            assert not extras["time_outs"][3]
+            assert faulty.episode_length_buf[3] == 0
+        for values in (obs["policy"], rewards, *extras["log"].values()):
+            assert values.isfinite().all()
+        assert torch.equal(obs["policy"][others], expected_obs["policy"][others])
+        assert torch.equal(rewards[others], expected_rewards[others])
+        assert torch.equal(dones[others], expected_dones[others])
+        assert torch.equal(faulty.sim.state.qvel[others], healthy.sim.state.qvel[others])
+
+
+def test_both_backends_show_the_same(make_env: MakeEnv) -> None:
+    native, warp = make_env(backend="native"), make_env(backend="warp")
+    for action in random_actions(10, 4, 0.3):
+        obs_n, rewards_n, dones_n, _ = native.step(action)
+        obs_w, rewards_w, dones_w, _ = warp.step(action)
+        torch.testing.assert_close(obs_w["policy"], obs_n["policy"], atol=2e-4, rtol=0.0)  # joint velocities lead
+        torch.testing.assert_close(rewards_w, rewards_n, atol=1e-4, rtol=0.0)
+        assert torch.equal(dones_w, dones_n)
+
+
+def test_the_same_seed_gives_the_same_numbers_and_another_does_not(make_env: MakeEnv) -> None:
+    a, b, other = make_env(num_envs=8), make_env(num_envs=8), make_env("seed=2", num_envs=8)
+    assert not torch.equal(observe(a), observe(other))
+    observe(b)
+    ended = 0
+    for action in random_actions(80, 8, 1.5):
+        obs_a, rewards_a, dones_a, _ = a.step(action)
+        obs_b, rewards_b, dones_b, _ = b.step(action)
+        assert torch.equal(obs_a["policy"], obs_b["policy"])
+        assert torch.equal(rewards_a, rewards_b)
+        assert torch.equal(dones_a, dones_b)
+        ended += int(dones_a.sum())
+    assert ended > 0  # resets are part of it
+
+
+class HostReads(TorchDispatchMode):
+    """Notes the operators that wait for the device, or whose result's shape depends on the data."""
+
+    OPERATORS = ("_local_scalar_dense", "item", "nonzero", "masked_select", "is_nonzero", "equal", "_unique2")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: list[str] = []
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        name = func.overloadpacket.__name__
+        boolean_index = name in ("index", "index_put", "index_put_") and any(
+            index is not None and index.dtype == torch.bool for index in args[1]
+        )
+        if name in self.OPERATORS or boolean_index:
+            self.seen.append(name)
+        return func(*args, **(kwargs or {}))
+
+
+def test_a_step_reads_nothing_back_to_the_host(make_env: MakeEnv) -> None:
+    with HostReads() as control:
+        torch.ones(3).sum().item()
+        torch.nonzero(torch.ones(3))
+        torch.ones(3)[torch.tensor([True, False, True])]
+    assert control.seen == ["_local_scalar_dense", "nonzero", "index"]
+
+    env = make_env("episode.length=0.06", "command.resampling_time=0.04", "disturbance.push.interval=[0.02,0.02]")
+    with HostReads() as reads:
+        for action in random_actions(8, 4):
+            env.step(action)
+    assert reads.seen == []
