@@ -161,7 +161,7 @@ class PpoConfig:
     obs_normalization: bool = MISSING
     init_std: float = quantity(gt=0)
     min_std: float = quantity(gt=0)
-    use_mixed_precision: bool = MISSING
+    mixed_precision: Literal["auto", "always", "never"] = MISSING
     save_interval: int = quantity(ge=1)
 
 

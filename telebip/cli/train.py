@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 def _train(options: argparse.Namespace, task: str, config: TaskConfig, run_dir: Path | None, checkpoint) -> None:
     from rich.console import Console
 
-    console = Console(highlight=False)
+    console = Console(highlight=False, soft_wrap=True)
     with console.status("loading torch and the physics engine"):
         from telebip.env import TelebipEnv
         from telebip.rl.run import create_run_dir, describe_run
@@ -72,7 +72,8 @@ def _train(options: argparse.Namespace, task: str, config: TaskConfig, run_dir: 
         return
     describe_run(run_dir, config, str(device), type(env.sim).__name__)
     backend = type(env.sim).__name__.removesuffix("Simulator").lower()
-    console.print(f"{task}: {config.num_envs} worlds on {device} ({backend}), writing to {run_dir}")
+    arithmetic = "bfloat16" if trainer.learner.use_mixed_precision else "float32"
+    console.print(f"{task}: {config.num_envs} worlds on {device} ({backend}), update in {arithmetic}, writing to {run_dir}")
     if trainer.iteration:
         console.print(f"resuming after iteration {trainer.iteration} of {total}")
 

@@ -142,17 +142,31 @@ class EpisodeStatistics:
         return (total[0] / total[2], total[1] / total[2]) if total[2] else (float("nan"), float("nan"))
 
 
+def uses_bfloat16(mixed_precision: str, device: torch.device) -> bool:
+    """Whether the update runs in bfloat16; `auto` asks the device whether it has instructions for it."""
+    if mixed_precision != "auto":
+        return mixed_precision == "always"
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    capabilities = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}
+    return bool(capabilities.get("avx512_bf16") or capabilities.get("amx_bf16"))
+
+
 def _rsl_rl_cfg(env: TelebipEnv) -> dict:
     ppo = env.cfg.ppo
     algorithm = (
         "num_learning_epochs num_mini_batches learning_rate schedule desired_kl gamma lam clip_param value_loss_coef "
-        "entropy_coef max_grad_norm use_mixed_precision"
+        "entropy_coef max_grad_norm"
     )
     return {
         "num_steps_per_env": ppo.num_steps_per_env,
         "obs_groups": OBS_GROUPS,
         "multi_gpu": None,
-        "algorithm": {"class_name": "PPO", **{name: getattr(ppo, name) for name in algorithm.split()}},
+        "algorithm": {
+            "class_name": "PPO",
+            **{name: getattr(ppo, name) for name in algorithm.split()},
+            "use_mixed_precision": uses_bfloat16(ppo.mixed_precision, env.device),
+        },
         "actor": {"class_name": "MLPModel", **actor_cfg(ppo)},
         "critic": {"class_name": "MLPModel", **critic_cfg(ppo)},
     }

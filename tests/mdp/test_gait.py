@@ -1,0 +1,95 @@
+"""The gait clock and the window of the periodic foot reward."""
+
+import math
+
+import pytest
+import torch
+
+from telebip.mdp.gait import foot_sample, phase_signals, push_sample, window_length, window_weights
+from telebip.mdp.rewards import periodic_foot_force
+
+PERIOD, STEP_DT, WEIGHT = 0.5, 0.02, 133.416
+HALF = math.sqrt(0.5)
+
+
+def walked_window(first_foot: int) -> torch.Tensor:
+    """One period in which the foot that the phase asks for (or, with 1, the other) carries all of the weight."""
+    window = torch.zeros(1, window_length(PERIOD, STEP_DT))
+    for step in range(window.shape[1]):
+        phase = phase_signals(torch.tensor([step * STEP_DT]), PERIOD)
+        force = torch.zeros(1, 2)
+        force[0, first_foot if phase[0, 0] > 0.0 else 1 - first_foot] = WEIGHT
+        window = push_sample(window, foot_sample(phase, force, WEIGHT))
+    return window
+
+
+@pytest.mark.parametrize(
+    ("time", "p_r"),
+    [(0.0, 0.0), (PERIOD / 8, HALF), (PERIOD / 4, 1.0), (PERIOD / 2, 0.0), (3 * PERIOD / 4, -1.0), (5 * PERIOD / 4, 1.0)],
+)
+def test_phase_signals_are_a_sine_and_its_opposite(time: float, p_r: float) -> None:
+    torch.testing.assert_close(phase_signals(torch.tensor([time]), PERIOD), torch.tensor([[p_r, -p_r]]), atol=1e-6, rtol=0.0)
+
+
+def test_half_a_period_later_the_feet_have_changed_roles() -> None:
+    time = torch.linspace(0.0, 2.0, 33)
+    torch.testing.assert_close(
+        phase_signals(time + PERIOD / 2, PERIOD), phase_signals(time, PERIOD).flip(1), atol=1e-5, rtol=0.0
+    )
+
+
+def test_window_holds_both_ends_of_one_period() -> None:
+    assert window_length(0.5, 0.02) == 26
+    assert window_length(0.6, 0.02) == 31
+
+
+def test_newest_sample_weighs_one_and_the_rest_fade() -> None:
+    torch.testing.assert_close(window_weights(4, 0.5, "newest"), torch.tensor([1.0, 0.5, 0.25, 0.125]))
+
+
+def test_read_as_the_article_prints_it_the_oldest_sample_weighs_one() -> None:
+    torch.testing.assert_close(window_weights(4, 0.5, "oldest"), torch.tensor([0.125, 0.25, 0.5, 1.0]))
+
+
+@pytest.mark.parametrize("first", ["newest", "oldest"])
+@pytest.mark.parametrize(("gamma", "total"), [(0.8, 4.985), (0.6, 2.5), (0.95, 14.729), (1.0, 26.0)])
+def test_weights_sum_to_the_geometric_series(first: str, gamma: float, total: float) -> None:
+    assert window_weights(26, gamma, first).sum().item() == pytest.approx(total, abs=1e-3)
+
+
+def test_foot_sample_weighs_forces_by_phase_in_body_weights() -> None:
+    phase = torch.tensor([[0.5, -0.5], [0.5, -0.5], [1.0, -1.0]])
+    force = torch.tensor([[200.0, 0.0], [0.0, 200.0], [60.0, 60.0]])
+    torch.testing.assert_close(foot_sample(phase, force, 100.0), torch.tensor([1.0, -1.0, 0.0]))
+
+
+def test_mirroring_the_world_leaves_the_foot_sample_unchanged() -> None:
+    generator = torch.Generator().manual_seed(0)
+    phase, force = torch.randn(16, 2, generator=generator), 200.0 * torch.rand(16, 2, generator=generator)
+    torch.testing.assert_close(foot_sample(phase.flip(1), force.flip(1), WEIGHT), foot_sample(phase, force, WEIGHT))
+
+
+def test_new_sample_enters_in_front_and_the_oldest_leaves() -> None:
+    window = torch.tensor([[3.0, 2.0, 1.0], [30.0, 20.0, 10.0]])
+    pushed = push_sample(window, torch.tensor([4.0, 40.0]))
+    torch.testing.assert_close(pushed, torch.tensor([[4.0, 3.0, 2.0], [40.0, 30.0, 20.0]]))
+
+
+@pytest.mark.parametrize("first", ["newest", "oldest"])
+def test_walking_in_phase_pays_what_walking_out_of_phase_costs(first: str) -> None:
+    weights = window_weights(26, 0.8, first)
+    in_phase = periodic_foot_force(walked_window(0), weights, 0.1)
+    assert in_phase.item() > 0.2
+    torch.testing.assert_close(periodic_foot_force(walked_window(1), weights, 0.1), -in_phase)
+
+
+def test_perfect_stepping_without_discount_sums_the_sine_over_a_period() -> None:
+    # sum over k = 0..24 of |sin(2 pi k / 25)| = cot(pi / 50) = 15.895
+    reward = periodic_foot_force(walked_window(0), window_weights(26, 1.0, "newest"), 0.1)
+    assert reward.item() == pytest.approx(0.1 / math.tan(math.pi / 50), rel=1e-5)
+
+
+def test_standing_on_both_feet_earns_nothing() -> None:
+    time = torch.arange(26) * STEP_DT
+    samples = foot_sample(phase_signals(time, PERIOD), torch.full((26, 2), WEIGHT / 2), WEIGHT)
+    torch.testing.assert_close(samples, torch.zeros(26))

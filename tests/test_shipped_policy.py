@@ -1,0 +1,64 @@
+"""The policy that comes with the repository walks as docs/results.md says."""
+
+import numpy as np
+import pytest
+
+from telebip import ROOT
+from telebip.config import load_task
+from telebip.env import TelebipEnv
+from telebip.eval.rollout import Rollout, roll_out
+from telebip.eval.walk import summarise
+from telebip.rl.checkpoint import load_checkpoint
+from telebip.rl.policy import load_policy
+from telebip.robot import Robot
+from telebip.sim import Backend
+
+SPEEDS = (0.5, 0.7, 1.0)  # m/s
+
+
+def walk(robot: Robot, speed: float, worlds: int, seconds: float, backend: Backend = "native") -> Rollout:
+    """Walk the shipped policy without disturbances, from random initial velocities."""
+    checkpoint = load_checkpoint(ROOT / "assets" / "policies" / "telebip_flat")
+    calm = [f"disturbance.{name}.enabled=false" for name in ("push", "friction", "noise")]
+    config = load_task(checkpoint.config, [f"num_envs={worlds}", f"episode.length={seconds + 1}", *calm])
+    env = TelebipEnv(config, robot, "cpu", backend)
+    env.set_command(speed, 0.0, 0.0)
+    return roll_out(env, load_policy(checkpoint, "cpu"), round(seconds / env.step_dt))
+
+
+@pytest.mark.parametrize("speed", SPEEDS)
+def test_it_walks_at_the_commanded_speed(robot: Robot, speed: float) -> None:
+    summary = summarise(walk(robot, speed, worlds=4, seconds=10.0), skip=5.0)
+    assert summary.falls == 0
+    assert summary.speed[0] == pytest.approx(speed, rel=0.05)
+    assert summary.gait_period == pytest.approx(0.5, rel=0.02)
+
+
+def test_its_feet_take_turns(robot: Robot) -> None:
+    feet = walk(robot, 0.7, worlds=2, seconds=6.0).foot_force[150:]
+    right, left = (feet[..., foot] > 20.0 for foot in range(2))  # N: the foot carries weight
+    assert np.mean(right & left) < 0.25
+    assert 0.8 < right.sum() / left.sum() < 1.25
+    shifted = np.roll(feet[..., 1], 12, axis=0)  # half a period is 12.5 steps
+    assert np.corrcoef(feet[12:, :, 0].ravel(), shifted[12:].ravel())[0, 1] > 0.5
+
+
+def test_it_walks_on_the_other_engine_too(robot: Robot) -> None:
+    summary = summarise(walk(robot, 0.7, worlds=4, seconds=6.0, backend="warp"), skip=3.0)
+    assert summary.falls == 0
+    assert summary.speed[0] == pytest.approx(0.7, rel=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("speed", SPEEDS)
+def test_sixty_four_worlds_walk_twenty_seconds(robot: Robot, speed: float) -> None:
+    summary = summarise(walk(robot, speed, worlds=64, seconds=20.0), skip=5.0)
+    assert summary.falls == 0
+    assert summary.speed[0] == pytest.approx(speed, rel=0.05)
+    assert summary.yaw_drift_deg < 10.0
+    assert summary.gait_period == pytest.approx(0.5, rel=0.02)
+
+
+def test_it_was_trained_on_the_published_task() -> None:
+    trained, published = load_checkpoint(ROOT / "assets" / "policies" / "telebip_flat").config, load_task("telebip_flat")
+    assert trained == published
