@@ -21,6 +21,9 @@ from telebip.errors import UserError, nearest
 
 CONFIGS = ROOT / "configs"
 
+Leaf = tuple[str, Any, str]
+"""A field of a file or override: dotted key, value, and the place to name in errors, as "file:line"."""
+
 
 def quantity(unit: str = "", **bounds: float) -> Any:
     """Declare a required number with its unit and bounds (`gt`, `ge`, `lt`, `le`), which hold for every entry of a tuple."""
@@ -192,17 +195,15 @@ def load_task(task: str | TaskConfig, overrides: Sequence[str] = ()) -> TaskConf
         config, task = OmegaConf.structured(task), "configuration"
     else:
         config = OmegaConf.structured(TaskConfig)
-        for path in reversed(_with_bases(_task_path(task))):
-            _apply(config, _read_yaml(path), origins)
+        for leaves in _layers(task):
+            _apply(config, leaves, origins)
     for override in overrides:
         key, equals, value = override.partition("=")
+        where = f"override '{override}'"
         if not equals or not re.fullmatch(r"\w+(\.\w+)*", key):
-            raise UserError(f"override '{override}' is not of the form key.path=value")
-        try:
-            parsed = OmegaConf.to_container(OmegaConf.from_dotlist([f"value={value}"]), resolve=True)["value"]  # type: ignore[index]
-        except (OmegaConfBaseException, yaml.YAMLError) as error:
-            raise UserError(f"override '{override}': {_one_line(error)}") from error
-        _apply(config, [(key, parsed, f"override '{override}'")], origins)
+            raise UserError(f"{where} is not of the form key.path=value")
+        _, parsed = _load_yaml(value, where)
+        _apply(config, [(key, parsed, where)], origins)
     return _validate(config, origins, task)
 
 
@@ -223,57 +224,66 @@ def task_names() -> list[str]:
     return sorted(path.stem for path in CONFIGS.glob("*.yaml"))
 
 
-def _task_path(task: str) -> Path:
-    path = Path(task) if task.endswith((".yaml", ".yml")) else CONFIGS / f"{task}.yaml"
-    if path.is_file():
-        return path
-    if path.suffix and path.parent != CONFIGS:
-        raise UserError(f"task file '{task}' does not exist")
-    raise UserError(f"unknown task '{task}'; {nearest(task, task_names())}")
-
-
-def _with_bases(path: Path) -> list[Path]:
-    """Return `path` and the files it builds on, itself first."""
-    paths = [path]
-    while base := _base_of(paths[-1]):
-        paths.append(_task_path(base))
-        if paths[-1] in paths[:-1]:
-            raise UserError(f"{_shown(path)}: base '{base}' leads back to itself")
-    return paths
-
-
-def _base_of(path: Path) -> str | None:
-    for key, value, where in _read_yaml(path, keep_base=True):
-        if key == "base":
-            if not isinstance(value, str):
-                raise UserError(f"{where}: base must be a task's name")
-            return value
-    return None
-
-
-def _read_yaml(path: Path, keep_base: bool = False) -> list[tuple[str, Any, str]]:
+def _layers(task: str, named_at: str = "", below: tuple[Path, ...] = ()) -> list[list[Leaf]]:
+    """Return the leaves of a task's file and, before them, of the bases it builds on."""
+    path = _task_path(task, named_at)
+    if path in below:
+        raise UserError(f"{named_at}base '{task}' leads back to itself")
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{_shown(path)}: {_one_line(error)}") from error
-    return [leaf for leaf in _parse_yaml(text, _shown(path)) if keep_base or leaf[0] != "base"]
+        raise UserError(f"{named_at}{_shown(path)}: {error}") from error
+    leaves = _parse_yaml(text, _shown(path))
+    for key, value, where in leaves:
+        if key == "base":
+            if not isinstance(value, str):
+                raise UserError(f"{where}: base must be the name of a task")
+            own = [leaf for leaf in leaves if leaf[0] != "base"]
+            return [*_layers(value, f"{where}: ", (*below, path)), own]
+    return [leaves]
 
 
-def _parse_yaml(text: str, source: str) -> list[tuple[str, Any, str]]:
-    """Return the leaves of a YAML mapping as (dotted key, value, "file:line")."""
+def _task_path(task: str, named_at: str) -> Path:
+    is_file = task.endswith((".yaml", ".yml"))
+    path = Path(task) if is_file else CONFIGS / f"{task}.yaml"
     try:
-        tree = yaml.compose(text, Loader=yaml.SafeLoader)
-        values = OmegaConf.to_container(OmegaConf.create(text), resolve=True) if tree else {}
-    except (yaml.YAMLError, OmegaConfBaseException, RecursionError, ValueError) as error:
-        raise UserError(f"{source}: not valid YAML: {_one_line(error)}") from error
-    if not isinstance(values, dict):
+        if path.is_file():
+            return path
+    except (OSError, ValueError):
+        pass  # no such file: the name is too long, or holds what no name can hold
+    if is_file:
+        raise UserError(f"{named_at}task file '{task}' does not exist")
+    raise UserError(f"{named_at}unknown task '{task}'; {nearest(task, task_names())}")
+
+
+def _parse_yaml(text: str, source: str) -> list[Leaf]:
+    """Return the leaves of a YAML mapping."""
+    tree, values = _load_yaml(text, source)
+    if values is None:
+        return []
+    if not isinstance(tree, yaml.MappingNode):
         raise UserError(f"{source}: a task is a mapping of fields to values")
-    return list(_leaves(tree, values, source)) if tree else []
+    try:
+        return list(_leaves(tree, values, source))
+    except RecursionError as error:  # an alias inside of what it stands for
+        raise UserError(f"{source}: a section contains itself") from error
 
 
-def _leaves(node: Any, values: Any, source: str, prefix: str = "") -> Iterator[tuple[str, Any, str]]:
+def _load_yaml(text: str, source: str) -> tuple[Any, Any]:
+    """Return YAML text as nodes, which know their lines, and as values."""
+    try:
+        return yaml.compose(text, Loader=yaml.SafeLoader), yaml.safe_load(text)
+    except Exception as error:  # PyYAML lets more than YAMLError escape, as from `!!int x`
+        raise UserError(f"{source}: not valid YAML: {error}") from error
+
+
+def _leaves(node: Any, values: Any, source: str, prefix: str = "") -> Iterator[Leaf]:
+    names = set()
     for key_node, value_node in node.value:
         key, where = str(key_node.value), f"{source}:{key_node.start_mark.line + 1}"
+        if key in names:
+            raise UserError(f"{where}: field '{prefix}{key}' stands there twice")
+        names.add(key)
         value = values.get(key) if isinstance(values, dict) else None
         if isinstance(value, dict) and value and isinstance(value_node, yaml.MappingNode):
             yield from _leaves(value_node, value, source, f"{prefix}{key}.")
@@ -281,15 +291,16 @@ def _leaves(node: Any, values: Any, source: str, prefix: str = "") -> Iterator[t
             yield f"{prefix}{key}", value, where
 
 
-def _apply(config: DictConfig, leaves: list[tuple[str, Any, str]], origins: dict[str, str]) -> None:
+def _apply(config: DictConfig, leaves: list[Leaf], origins: dict[str, str]) -> None:
     """Set the leaves one by one, so that an error knows its place; remember where each came from."""
     for key, value, where in leaves:
         schema = _schema_of(key, where)
         if dataclasses.is_dataclass(schema):
-            raise UserError(
-                f"{where}: {key} is a section; set one of its fields: {', '.join(f.name for f in dataclasses.fields(schema))}"
-            )
+            names = ", ".join(f.name for f in dataclasses.fields(schema))
+            raise UserError(f"{where}: {key} is a section; set one of its fields: {names}")
         try:
+            if "${" in str(value):
+                raise ValueError("OmegaConf would look the value up elsewhere")
             OmegaConf.update(config, key, value)
         except (OmegaConfBaseException, OverflowError, ValueError, TypeError) as error:
             raise UserError(f"{where}: {key}: {_describe(value)} is not {_type_name(schema)}") from error
@@ -322,7 +333,7 @@ def _type_name(schema: Any) -> str:
 
 
 def _describe(value: Any) -> str:
-    text = repr(value)
+    text = repr(value) if isinstance(value, str) else str(value)
     return text if len(text) <= 40 else text[:37] + "..."
 
 
@@ -369,7 +380,3 @@ def _values(node: Any, prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
 
 def _shown(path: Path) -> str:
     return str(path.relative_to(ROOT)) if path.is_relative_to(ROOT) else str(path)
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())

@@ -10,6 +10,10 @@ class UserError(Exception):
     Every script prints it as `error: <message>` and exits with status 2; anything else that escapes is a bug of ours.
     """
 
+    def __init__(self, message: str) -> None:
+        """Keep to one printable line whatever the message quotes."""
+        super().__init__(" ".join(message.split()).encode("utf-8", "backslashreplace").decode())
+
 
 def nearest(name: str, valid: Iterable[str]) -> str:
     """Return the end of an error line: the closest valid name, or all of them: `nearest("slwo", ["slow", "fast"])`."""
