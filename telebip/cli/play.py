@@ -30,7 +30,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         checkpoint = load_checkpoint(options.checkpoint)
         task, config, label = checkpoint.task, checkpoint.config, str(checkpoint.path)
     else:
-        task, config, label = options.task, load_task(options.task), f"agent '{options.agent}'"
+        task, config, label = Path(options.task).stem, load_task(options.task), f"agent '{options.agent}'"
     command = _command(options.command, config)
     _play(options, task, _as_played(config, options), command, checkpoint, label)
 
@@ -41,8 +41,6 @@ def _play(options: argparse.Namespace, task: str, config: TaskConfig, command, c
 
     console = Console(highlight=False, soft_wrap=True)
     with console.status("loading torch and the physics engine"):
-        import torch
-
         from telebip.env import TelebipEnv
         from telebip.eval.rollout import roll_out
         from telebip.eval.walk import summarise
@@ -56,12 +54,8 @@ def _play(options: argparse.Namespace, task: str, config: TaskConfig, command, c
         from telebip.rl.policy import load_policy
 
         policy = load_policy(checkpoint, device)
-    elif options.agent == "zero":
-        policy = lambda obs: torch.zeros(env.num_envs, env.num_actions, device=device)  # noqa: E731
     else:
-        policy = lambda obs: torch.randn(  # noqa: E731
-            env.num_envs, env.num_actions, generator=env.generator, device=device
-        )
+        policy = _agent(options.agent, env)
     _warn_untrained(console, command, checkpoint)
 
     steps = max(1, round(options.duration / env.step_dt))
@@ -81,6 +75,16 @@ def _play(options: argparse.Namespace, task: str, config: TaskConfig, command, c
 
         record(rollout, robot.path.with_suffix(".urdf"), Path(options.record))
         console.print(f"recorded {options.record}; look at it with: rerun {options.record}")
+
+
+def _agent(name: str, env):
+    """Return a stand-in for a policy: `zero` holds the nominal pose, `random` draws standard normal actions."""
+    import torch
+
+    shape = (env.num_envs, env.num_actions)
+    if name == "zero":
+        return lambda obs: torch.zeros(shape, device=env.device)
+    return lambda obs: torch.randn(shape, generator=env.generator, device=env.device)
 
 
 def _lines(s) -> str:

@@ -20,7 +20,7 @@ class WalkSummary:
     command: tuple[float, float, float]  # m/s, m/s, rad/s
     speed: tuple[float, float]  # forward and leftward along the heading [m/s]
     speed_spread: float  # standard deviation of the worlds' mean forward speeds [m/s]
-    lin_vel_error: float  # mean ||v_cmd - v||, as in the reward [m/s]
+    lin_vel_error: float  # mean ||v_cmd - v||, with the velocity along and to the left of the heading [m/s]
     yaw_rate: float  # rad/s
     yaw_drift_deg: float  # mean absolute deviation from the reference heading at the end [deg]
     cost_of_transport: float  # see `cost_of_transport`

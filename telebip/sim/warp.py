@@ -15,7 +15,7 @@ from telebip.robot import Robot
 from telebip.sim.base import SimState
 
 MAX_CONTACTS, MAX_CONSTRAINTS = 8, 64
-"""Per world: two feet, the feet against each other and a fallen trunk make 7 contacts of 6 rows; joint limits add 6."""
+"""Per world: two feet, the feet against each other and a fallen trunk make 7 contacts of at most 6 rows; joint limits add 6."""
 
 
 @wp.kernel
