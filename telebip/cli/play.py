@@ -59,7 +59,7 @@ def _play(options: argparse.Namespace, task: str, config: TaskConfig, command, c
     _warn_untrained(console, command, checkpoint)
 
     steps = max(1, round(options.duration / env.step_dt))
-    with Progress(console=console, transient=True) as bar:
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
         walking = bar.add_task("walking", total=steps)
         rollout = roll_out(env, policy, steps, progress=lambda step: bar.update(walking, completed=step))
     summary = summarise(rollout, skip=min(5.0, 0.25 * options.duration))

@@ -70,8 +70,8 @@ def _train(options: argparse.Namespace, task: str, config: TaskConfig, run_dir: 
     if trainer.iteration >= total:
         console.print(f"{run_dir} has finished its {total} iterations; raise --max-iterations to train on")
         return
-    describe_run(run_dir, config, str(device), type(env.sim).__name__)
     backend = type(env.sim).__name__.removesuffix("Simulator").lower()
+    describe_run(run_dir, config, str(device), backend)
     arithmetic = "bfloat16" if trainer.learner.use_mixed_precision else "float32"
     console.print(f"{task}: {config.num_envs} worlds on {device} ({backend}), update in {arithmetic}, writing to {run_dir}")
     if trainer.iteration:

@@ -59,9 +59,9 @@ class Trainer:
         """
         env, learner, cfg = self.env, self.learner, self.env.cfg.ppo
         writer = SummaryWriter(str(self.run_dir), purge_step=self.samples + 1)
-        if self.iteration == 0:  # spread the time-outs over the iterations
-            ages = torch.randint(env.max_episode_length, (env.num_envs,), generator=env.generator, device=env.device)
-            env.episode_length_buf = ages
+        # Spread the time-outs over the iterations.
+        ages = torch.randint(env.max_episode_length, (env.num_envs,), generator=env.generator, device=env.device)
+        env.episode_length_buf = ages
         learner.train_mode()
         obs = env.get_observations()
         while self.iteration < cfg.max_iterations and not stop():
