@@ -64,11 +64,14 @@ class WarpSimulator:
         self.device = device
         self._decimation = decimation
         self._foot_adr = robot.foot_sensor_adr
-        wp.config.log_level = wp.LOG_WARNING  # not a line for each of a hundred kernels
+        # Not a line for each of a hundred kernels; and on the CPU no complaint that there is no CUDA driver.
+        wp.config.log_level = wp.LOG_WARNING if device.type == "cuda" else wp.LOG_ERROR
         wp.init()
         self._wp_device = wp.device_from_torch(device)
         with wp.ScopedDevice(self._wp_device):
             self._model = mjw.put_model(robot.model, batch_sizes=dict.fromkeys(model_fields, num_envs))
+            # The MJCF's limits on solver iterations are meant; exceeded capacities still print.
+            self._model.opt.warn_overflow &= ~(mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS)
             self._data = mjw.make_data(robot.model, nworld=num_envs, nconmax=MAX_CONTACTS, njmax=MAX_CONSTRAINTS)
         self.model_fields = {name: wp.to_torch(getattr(self._model, name)) for name in model_fields}
         for name, field in self.model_fields.items():
