@@ -64,8 +64,7 @@ class WarpSimulator:
         self.device = device
         self._decimation = decimation
         self._foot_adr = robot.foot_sensor_adr
-        # Not a line for each of a hundred kernels; and on the CPU no complaint that there is no CUDA driver.
-        wp.config.log_level = wp.LOG_WARNING if device.type == "cuda" else wp.LOG_ERROR
+        wp.config.log_level = wp.LOG_WARNING  # not a line for each of a hundred kernels
         wp.init()
         self._wp_device = wp.device_from_torch(device)
         with wp.ScopedDevice(self._wp_device):
