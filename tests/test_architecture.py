@@ -15,7 +15,7 @@ LAYERS = [
     {"telebip.sim"},
     {"telebip.mdp"},
     {"telebip.env"},
-    {"telebip.rl", "telebip.eval", "telebip.viz"},
+    {"telebip.rl", "telebip.control", "telebip.eval", "telebip.viz"},
     {"telebip.cli"},
     {"scripts"},
 ]

@@ -81,10 +81,12 @@ def _agent(name: str, env):
     """Return a stand-in for a policy: `zero` holds the nominal pose, `random` draws standard normal actions."""
     import torch
 
+    from telebip.control.policy import Stateless
+
     shape = (env.num_envs, env.num_actions)
     if name == "zero":
-        return lambda obs: torch.zeros(shape, device=env.device)
-    return lambda obs: torch.randn(shape, generator=env.generator, device=env.device)
+        return Stateless(lambda obs: torch.zeros(shape, device=env.device))
+    return Stateless(lambda obs: torch.randn(shape, generator=env.generator, device=env.device))
 
 
 def _lines(s) -> str:

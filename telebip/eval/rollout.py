@@ -6,13 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tensordict import TensorDict
 from torch import Tensor
 
+from telebip.control.policy import Policy
 from telebip.env import TelebipEnv
-
-Policy = Callable[[TensorDict], Tensor]
-"""Observations {"policy": (num_envs, 33)} to actions (num_envs, 6)."""
 
 
 @dataclass(frozen=True)
@@ -45,16 +42,18 @@ def roll_out(env: TelebipEnv, policy: Policy, steps: int, progress: Callable[[in
 
     Args:
         env: fallen worlds are reset and go on.
-        policy: what walks.
+        policy: what walks; its memory of all worlds is cleared first.
         steps: number of policy steps.
         progress: called with the number of finished steps.
     """
     rows: list[dict[str, Tensor]] = []
     with torch.inference_mode():
+        policy.reset(torch.ones(env.num_envs, dtype=torch.bool, device=env.device))
         obs = env.get_observations()
         for step in range(steps):
             command = env.target_command.clone()
             obs, reward, dones, extras = env.step(policy(obs))
+            policy.reset(dones)
             row = {
                 **{name: getattr(env.sim.state, name) for name in ("qpos", "qvel", "joint_force", "joint_power", "foot_force")},
                 "joint_target": env.joint_target,

@@ -1,14 +1,13 @@
 """From a configuration to rsl-rl's networks, and from a checkpoint to a policy."""
 
-from collections.abc import Callable
 from typing import Any
 
 import torch
 from rsl_rl.models import MLPModel
 from tensordict import TensorDict
-from torch import Tensor
 
 from telebip.config import PpoConfig
+from telebip.control.policy import Policy
 from telebip.errors import UserError
 from telebip.mdp.observations import LAYOUT
 from telebip.rl.checkpoint import Checkpoint
@@ -34,8 +33,8 @@ def critic_cfg(ppo: PpoConfig) -> dict[str, Any]:
     return {"hidden_dims": list(ppo.hidden_dims), "activation": ppo.activation, "obs_normalization": ppo.obs_normalization}
 
 
-def load_policy(checkpoint: Checkpoint, device: str | torch.device) -> Callable[[TensorDict], Tensor]:
-    """Return the checkpoint's deterministic policy: observations {"policy": (num_envs, 33)} to actions (num_envs, 6).
+def load_policy(checkpoint: Checkpoint, device: str | torch.device) -> Policy:
+    """Return the checkpoint's deterministic policy.
 
     Raises:
         UserError: the weights do not fit the configuration they came with.

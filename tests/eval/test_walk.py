@@ -9,6 +9,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from telebip.control.policy import Stateless
 from telebip.env import TelebipEnv
 from telebip.eval.rollout import Rollout, roll_out
 from telebip.eval.walk import cost_of_transport, cost_of_transport_article, gait_period, heading_velocity, summarise
@@ -125,7 +126,7 @@ def test_falls_count_from_the_start() -> None:
 def test_a_rollout_of_real_worlds(make_env: Callable[..., TelebipEnv]) -> None:
     env = make_env("episode.length=0.2")
     finished: list[int] = []
-    rollout = roll_out(env, lambda obs: torch.zeros(4, 6), 15, progress=finished.append)
+    rollout = roll_out(env, Stateless(lambda obs: torch.zeros(4, 6)), 15, progress=finished.append)
     assert finished == list(range(1, 16))
     np.testing.assert_allclose(rollout.time, np.linspace(0.02, 0.30, 15))
     assert (rollout.step_dt, rollout.weight) == (pytest.approx(0.02), pytest.approx(13.6 * 9.81))

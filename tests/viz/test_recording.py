@@ -12,6 +12,7 @@ import torch
 import yourdfpy
 from numpy.typing import NDArray
 
+from telebip.control.policy import Stateless
 from telebip.env import TelebipEnv
 from telebip.errors import UserError
 from telebip.eval.rollout import Rollout, roll_out
@@ -29,7 +30,7 @@ Columns = dict[str, dict[str, list[Any]]]
 
 @pytest.fixture(scope="module")
 def rollout(make_env: Callable[..., TelebipEnv]) -> Rollout:
-    return roll_out(make_env(num_envs=2), lambda obs: torch.zeros(2, 6), STEPS)
+    return roll_out(make_env(num_envs=2), Stateless(lambda obs: torch.zeros(2, 6)), STEPS)
 
 
 @pytest.fixture(scope="module")
