@@ -97,6 +97,13 @@ class FootRewardConfig:
     k_foot: float = quantity()
     gamma: float = quantity(gt=0, le=1)
     first: Literal["newest", "oldest"] = MISSING
+    cap: float = quantity("body weights", gt=0)
+
+
+@dataclass
+class EnergyRewardConfig:
+    k_energy: float = quantity("s/m", le=0)
+    ramp: tuple[float, float] = quantity("samples", ge=0)
 
 
 @dataclass
@@ -110,6 +117,7 @@ class RewardConfig:
     diff: DiffRewardConfig = section(DiffRewardConfig)
     tq: TqRewardConfig = section(TqRewardConfig)
     foot: FootRewardConfig = section(FootRewardConfig)
+    energy: EnergyRewardConfig = section(EnergyRewardConfig)
     termination: TerminationRewardConfig = section(TerminationRewardConfig)
 
 
@@ -164,6 +172,8 @@ class PpoConfig:
     obs_normalization: bool = MISSING
     init_std: float = quantity(gt=0)
     min_std: float = quantity(gt=0)
+    final_min_std: float = quantity(gt=0)
+    min_std_ramp: tuple[float, float] = quantity("samples", ge=0)
     mixed_precision: Literal["auto", "always", "never"] = MISSING
     save_interval: int = quantity(ge=1)
 

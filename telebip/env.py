@@ -11,6 +11,7 @@ from telebip.mdp import gait, terminations
 from telebip.mdp.actions import joint_targets
 from telebip.mdp.commands import hold_heading, sample_commands
 from telebip.mdp.context import StepContext
+from telebip.mdp.curriculum import ramp
 from telebip.mdp.observations import heading_relative_quat, noise_amplitude, observation
 from telebip.mdp.randomization import initial_state, sample_pushes, uniform
 from telebip.mdp.rewards import REWARDS
@@ -75,6 +76,7 @@ class TelebipEnv(VecEnv):
         self._command_timer = zeros()  # time until the next command [s]
         self._foot_window = zeros(window)
         self._base_lin_vel_b = zeros(3)
+        self._energy_share = torch.ones((), device=self.device)
         self._command_is_fixed = False
 
         self.reset()
@@ -92,6 +94,10 @@ class TelebipEnv(VecEnv):
         self._command_is_fixed = True
         self.target_command.copy_(torch.tensor([lin_vel_x, lin_vel_y, ang_vel_z]).expand(self.num_envs, -1))
         self._update_commands()
+
+    def set_progress(self, samples: float) -> None:
+        """Bring the curriculum to where a training stands after `samples` environment steps; a new one is complete."""
+        self._energy_share.fill_(ramp(samples, self.cfg.reward.energy.ramp))
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
         """Apply `actions` (num_envs, 6) for one policy step.
@@ -116,7 +122,7 @@ class TelebipEnv(VecEnv):
         self._command_timer -= self.step_dt
         self.reference_heading.copy_(wrap_angle(self.reference_heading + self.step_dt * self.target_command[:, 2]))
         self._base_lin_vel_b.copy_(rotate_inverse(state.base_quat, state.base_lin_vel_w))
-        sample = gait.foot_sample(self.phase, state.foot_force, self.robot.weight)
+        sample = gait.foot_sample(self.phase, state.foot_force, self.robot.weight, cfg.reward.foot.cap)
         self._foot_window.copy_(gait.push_sample(self._foot_window, sample))
 
         # 3. Terminations. A world with a non-finite state ends its episode like a fall, and is counted as a fault.
@@ -133,8 +139,10 @@ class TelebipEnv(VecEnv):
             action=actions,
             last_action=self.last_action,
             force_limit=self._force_limit,
+            weight=self.robot.weight,
             foot_window=self._foot_window,
             foot_weights=self._foot_weights,
+            energy_share=self._energy_share,
             fallen=terminated,
         )
         terms = torch.stack([term(context, cfg.reward) for term in REWARDS.values()])

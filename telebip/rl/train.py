@@ -16,8 +16,10 @@ from rsl_rl.algorithms import PPO
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
+from telebip.config import PpoConfig
 from telebip.env import TelebipEnv
 from telebip.errors import UserError
+from telebip.mdp.curriculum import ramp
 from telebip.rl.checkpoint import Checkpoint, save_checkpoint
 from telebip.rl.policy import OBS_GROUPS, actor_cfg, critic_cfg
 
@@ -67,6 +69,8 @@ class Trainer:
         while self.iteration < cfg.max_iterations and not stop():
             start = time.perf_counter()
             logs: dict[str, Tensor] = {}
+            env.set_progress(self.samples)
+            learner.get_policy().distribution.std_range[0] = min_std(cfg, self.samples)  # type: ignore[union-attr]
             with torch.inference_mode():
                 for _ in range(cfg.num_steps_per_env):
                     obs, rewards, dones, extras = env.step(learner.act(obs))
@@ -140,6 +144,11 @@ class EpisodeStatistics:
             self._history.popleft()
         total = [sum(column) for column in zip(*self._history, strict=True)]
         return (total[0] / total[2], total[1] / total[2]) if total[2] else (float("nan"), float("nan"))
+
+
+def min_std(cfg: PpoConfig, samples: int) -> float:
+    """Return the floor of the action's standard deviation after `samples`: from `min_std` to `final_min_std`, geometrically."""
+    return cfg.min_std * (cfg.final_min_std / cfg.min_std) ** ramp(samples, cfg.min_std_ramp)
 
 
 def uses_bfloat16(mixed_precision: str, device: torch.device) -> bool:
