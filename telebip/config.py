@@ -169,6 +169,7 @@ class PpoConfig:
     max_grad_norm: float = quantity(gt=0)
     hidden_dims: list[int] = quantity(ge=1)
     activation: Literal["elu", "relu", "selu", "tanh"] = MISSING
+    symmetry: Literal["none", "phase"] = MISSING
     obs_normalization: bool = MISSING
     init_std: float = quantity(gt=0)
     min_std: float = quantity(gt=0)

@@ -91,8 +91,12 @@ class TelebipEnv(VecEnv):
 
     def set_command(self, lin_vel_x: float, lin_vel_y: float, ang_vel_z: float) -> None:
         """Give every world this command [m/s, m/s, rad/s], for good: no random ones are drawn any more."""
+        self.set_commands(torch.tensor([lin_vel_x, lin_vel_y, ang_vel_z]).expand(self.num_envs, -1))
+
+    def set_commands(self, commands: Tensor) -> None:
+        """Give each world its row of `commands` (num_envs, 3) [m/s, m/s, rad/s], for good."""
         self._command_is_fixed = True
-        self.target_command.copy_(torch.tensor([lin_vel_x, lin_vel_y, ang_vel_z]).expand(self.num_envs, -1))
+        self.target_command.copy_(commands)
         self._update_commands()
 
     def set_progress(self, samples: float) -> None:

@@ -11,6 +11,7 @@ from telebip.control.policy import Policy
 from telebip.errors import UserError
 from telebip.mdp.observations import LAYOUT
 from telebip.rl.checkpoint import Checkpoint
+from telebip.rl.symmetry import SymmetricPolicy
 from telebip.robot import JOINTS
 
 OBS_GROUPS = {"actor": ["policy"], "critic": ["policy"]}
@@ -45,4 +46,5 @@ def load_policy(checkpoint: Checkpoint, device: str | torch.device) -> Policy:
         actor.load_state_dict(checkpoint.learner["actor_state_dict"])
     except (RuntimeError, KeyError) as error:
         raise UserError(f"checkpoint '{checkpoint.path}': its weights do not fit its configuration") from error
-    return actor.to(device).eval()
+    policy = SymmetricPolicy(actor, device) if checkpoint.config.ppo.symmetry == "phase" else actor
+    return policy.to(device).eval()
