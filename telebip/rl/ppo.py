@@ -7,6 +7,8 @@ observation and the learning rate, compute their gradients side by side. Losses,
 and checkpoints are rsl-rl's; `tests/rl/test_ppo.py` holds one update against its own.
 """
 
+# pyright: reportOptionalMemberAccess=false, reportOptionalIterable=false
+# rsl-rl declares an actor's distribution and the storage's parameters of it optional.
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass

@@ -2,6 +2,7 @@
 
 import copy
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -39,8 +40,8 @@ def stock_copy(learner: PPO) -> PPO:
         "num_learning_epochs num_mini_batches clip_param gamma lam value_loss_coef entropy_coef learning_rate "
         "max_grad_norm schedule desired_kl use_mixed_precision"
     )
-    parts = (copy.deepcopy(part) for part in (learner.actor, learner.critic, learner.storage))
-    stock = PPO(*parts, **{name: getattr(learner, name) for name in names.split()})
+    settings: dict[str, Any] = {name: getattr(learner, name) for name in names.split()}
+    stock = PPO(copy.deepcopy(learner.actor), copy.deepcopy(learner.critic), copy.deepcopy(learner.storage), **settings)
     stock.optimizer.load_state_dict(copy.deepcopy(learner.optimizer.state_dict()))
     stock.train_mode()
     return stock
@@ -74,6 +75,7 @@ def test_a_rollout_holds_what_its_own_policy_said(robot: Robot, precision: str) 
     learner, storage = trainer.learner, trainer.learner.storage
     tolerance = 1e-5 if precision == "never" else 2e-2
     obs = storage.observations.flatten(0, 1)
+    assert storage.distribution_params is not None
     mean, std = (x.flatten(0, 1) for x in storage.distribution_params)
     with torch.no_grad():
         torch.testing.assert_close(mean, learner.actor(obs), rtol=tolerance, atol=tolerance)
