@@ -54,11 +54,14 @@ def _train(options: argparse.Namespace, task: str, config: TaskConfig, run_dir: 
     console = Console(highlight=False, soft_wrap=True)
     with console.status("loading torch and the physics engine"):
         from telebip.env import TelebipEnv
+        from telebip.rl.process import prepare_cpu
         from telebip.rl.run import create_run_dir, describe_run
         from telebip.rl.train import Trainer
         from telebip.robot import load_robot
 
     device = resolve_device(options.device)
+    if device.type == "cpu":
+        prepare_cpu()
     robot = load_robot(config.sim.robot)
     with console.status("creating the worlds (the warp backend compiles for a minute or two the first time)"):
         env = TelebipEnv(config, robot, device, options.backend)

@@ -12,7 +12,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
-from rsl_rl.algorithms import PPO
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
@@ -23,6 +22,7 @@ from telebip.mdp.curriculum import ramp
 from telebip.rl.checkpoint import Checkpoint, save_checkpoint
 from telebip.rl.curve import CurveWriter
 from telebip.rl.policy import OBS_GROUPS, actor_cfg, critic_cfg
+from telebip.rl.ppo import FastPPO
 from telebip.rl.symmetry import SymmetricEnv
 
 
@@ -41,7 +41,7 @@ class Trainer:
             )
         torch.manual_seed(env.cfg.seed)
         with contextlib.redirect_stdout(io.StringIO()):  # rsl-rl prints the networks
-            self.learner = PPO.construct_algorithm(env.get_observations(), env, _rsl_rl_cfg(env), str(env.device))
+            self.learner = FastPPO.construct_algorithm(env.get_observations(), env, _rsl_rl_cfg(env), str(env.device))
         self._view = SymmetricEnv(env) if ppo.symmetry == "phase" else env
         self._episodes = EpisodeStatistics(env.num_envs, env.device)
 
@@ -177,7 +177,7 @@ def _rsl_rl_cfg(env: TelebipEnv) -> dict:
         "obs_groups": OBS_GROUPS,
         "multi_gpu": None,
         "algorithm": {
-            "class_name": "PPO",
+            "class_name": FastPPO,
             **{name: getattr(ppo, name) for name in algorithm.split()},
             "use_mixed_precision": uses_bfloat16(ppo.mixed_precision, env.device),
         },
