@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Sequence
+from hashlib import sha256
 from pathlib import Path
 
 from telebip.cli.common import Parser, resolve_device
@@ -12,6 +13,7 @@ EXAMPLES = """\
   evaluate.py --checkpoint assets/policies/telebip_efficient --out report
   evaluate.py --checkpoint runs/telebip_flat/2026-01-31_12-00-00 --suite tracking,gait
   evaluate.py --checkpoint assets/policies/telebip_flat --suite push --max-force 150
+  evaluate.py --controller dcm control.step_time=0.2 sim.decimation=1
 """
 
 
@@ -28,7 +30,10 @@ def main(argv: Sequence[str] | None = None) -> None:
         from telebip.robot import load_robot
     suites = check_suites(options.suite.split(","))
     device = resolve_device(options.device)
-    subject = subject_of(options.checkpoint, options.label, options.overrides)
+    if options.controller:
+        subject = controller_subject(options.controller, options.label, options.overrides)
+    else:
+        subject = subject_of(options.checkpoint, options.label, options.overrides)
     push = PushProtocol(max_force=options.max_force, worlds=options.push_worlds)
     protocol = Protocol(
         worlds=options.num_envs,
@@ -36,7 +41,6 @@ def main(argv: Sequence[str] | None = None) -> None:
         skip=min(5.0, 0.25 * options.duration),
         commands=tuple(options.commands) if options.commands else None,
         push=push,
-        overrides=tuple(options.overrides),
         device=device,
         backend=options.backend,
     )
@@ -49,6 +53,23 @@ def main(argv: Sequence[str] | None = None) -> None:
     write_report([results], out, f"{subject.label}: how it walks", f"Measured by: {subject.source}", references=references())
     console.print((out / "report.md").read_text(encoding="utf-8"), markup=False)
     console.print(f"wrote {out}/results.json, report.md and report.html")
+
+
+def controller_subject(name: str, label: str | None, overrides: Sequence[str] = ()):
+    """Return a model-based walker as a subject of the evaluator, with `overrides` of its parameters and of the task."""
+    from telebip.control.factory import make_controller
+    from telebip.eval.suites import Subject
+
+    own = [override for override in overrides if override.startswith("control.")]
+    task = [override for override in overrides if not override.startswith("control.")]
+    return Subject(
+        label=label or name,
+        config=load_task("telebip_flat", task),
+        make_policy=lambda env: make_controller(name, env, own),
+        limited=False,
+        source=" ".join(["evaluate.py --controller", name, *overrides]),
+        fingerprint=" ".join([name, *overrides]),
+    )
 
 
 def subject_of(checkpoint_path: str, label: str | None, overrides: Sequence[str] = ()):
@@ -64,6 +85,7 @@ def subject_of(checkpoint_path: str, label: str | None, overrides: Sequence[str]
         make_policy=lambda env: load_policy(checkpoint, env.device),
         run_dir=checkpoint.path.parent,
         source=f"evaluate.py --checkpoint {checkpoint_path}",
+        fingerprint=sha256(checkpoint.path.read_bytes()).hexdigest()[:16],
     )
 
 
@@ -101,7 +123,9 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         "Measure how something walks (tracking, energy, pushes, gait, learning) and report it beside the article's numbers.",
         EXAMPLES,
     )
-    parser.add_argument("--checkpoint", metavar="PATH_OR_RUN", help="a checkpoint file, or a run folder for its newest")
+    who = parser.add_mutually_exclusive_group()
+    who.add_argument("--checkpoint", metavar="PATH_OR_RUN", help="a checkpoint file, or a run folder for its newest")
+    who.add_argument("--controller", choices=("alip", "dcm"), help="a model-based walker: angular momentum, or DCM")
     parser.add_argument(
         "--suite",
         default="tracking,push,gait,learning",
@@ -127,8 +151,8 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--backend", default="auto", choices=("auto", "native", "warp"), help="physics engine (default: auto)")
     parser.add_argument("overrides", nargs="*", metavar="key.path=value", help="override any field of the task")
     options = parser.parse(argv)
-    if not options.checkpoint:
-        raise UserError("what is to be measured? --checkpoint PATH_OR_RUN (try assets/policies/telebip_flat)")
+    if not (options.checkpoint or options.controller):
+        raise UserError("what is to be measured? --checkpoint PATH_OR_RUN (try assets/policies/telebip_flat), or --controller")
     for name, low, high in (
         ("num_envs", 1, 2**20),
         ("duration", 1.0, 3600.0),

@@ -80,7 +80,7 @@ def _train(options: argparse.Namespace, task: str, config: TaskConfig, run_dir: 
     if trainer.iteration:
         console.print(f"resuming after iteration {trainer.iteration} of {total}")
 
-    with _stop_on_signal(console) as stop, _progress_bar(console, trainer) as show:
+    with stop_on_signal(console) as stop, progress_bar(console, trainer) as show:
         trainer.learn(stop, show)
     finished = trainer.iteration >= total
     if not finished:
@@ -112,7 +112,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
 
 
 @contextmanager
-def _stop_on_signal(console):
+def stop_on_signal(console):
     """Yield a function that tells whether to stop: one Ctrl-C ends the run after its iteration, a second one at once."""
     asked = False
 
@@ -132,7 +132,7 @@ def _stop_on_signal(console):
 
 
 @contextmanager
-def _progress_bar(console, trainer):
+def progress_bar(console, trainer):
     """Yield a function that shows an iteration's scalars: a live bar on a terminal, else one line per fiftieth of the run."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 

@@ -44,7 +44,8 @@ class Subject:
     make_policy: Callable[[TelebipEnv], Policy]
     limited: bool = True  # to the commands it was trained on; a model-based controller takes any
     run_dir: Path | None = None  # where its learning curve is kept
-    source: str = ""  # how to get it: a path, a command
+    source: str = ""  # how to measure it again: a command
+    fingerprint: str = ""  # of what decides how it walks: weights, parameters
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,6 @@ class Protocol:
     skip: float = 5.0  # s, left out of all means
     commands: tuple[float, ...] | None = None  # m/s; None: those of `COMMANDS` that the policy was trained on
     push: PushProtocol = field(default_factory=PushProtocol)
-    overrides: tuple[str, ...] = ()  # of the task
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
     backend: Backend = "auto"
 
@@ -85,6 +85,7 @@ def evaluate(
         "schema": "telebip-results-1",
         "label": subject.label,
         "source": subject.source,
+        "fingerprint": subject.fingerprint,
         "telebip": __version__,
         "date": datetime.now().astimezone().isoformat(timespec="seconds"),
         "machine": f"{platform.machine()}, {protocol.device}",
@@ -94,7 +95,6 @@ def evaluate(
             "skip_s": protocol.skip,
             "seed": subject.config.seed,
             "gait_period_s": subject.config.gait.period,
-            "overrides": list(protocol.overrides),
         },
     }
     if "tracking" in suites or "gait" in suites:
@@ -123,7 +123,7 @@ def commands_of(subject: Subject, protocol: Protocol) -> tuple[float, ...]:
 
 def make_env(subject: Subject, robot: Robot, protocol: Protocol, num_envs: int, duration: float) -> TelebipEnv:
     """Create undisturbed worlds of the subject's task."""
-    config = as_evaluated(subject.config, num_envs, duration, protocol.overrides)
+    config = as_evaluated(subject.config, num_envs, duration)
     return TelebipEnv(config, robot, protocol.device, protocol.backend)
 
 
