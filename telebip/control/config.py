@@ -15,6 +15,7 @@ class WalkerConfig:
     step_width: float = quantity("m", gt=0)
     hip_height: float = quantity("m", gt=0)
     heading_filter: float = quantity("s", gt=0)
+    acceleration: float = quantity("m/s^2", gt=0)
     speed_gain: float = quantity("per step", ge=0, le=1)
     speed_limit: float = quantity("m/s", ge=0)
     steering_gain: float = quantity("m/rad", ge=0)

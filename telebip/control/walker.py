@@ -76,6 +76,7 @@ class Walker:
         self._lift_off = zeros(3)  # see `swing_path`
         self._path = zeros(2)  # way of the centre of mass since the step's beginning [m]
         self._elapsed = zeros()  # time since then [s]
+        self._velocity = zeros(2)  # the command, with bounded acceleration [m/s]
         self._speed = zeros(2)  # v_int, what the integral of the speed error adds to the command [m/s]
 
     def reset(self, mask: Tensor, /) -> None:
@@ -138,8 +139,12 @@ class Walker:
         sway = torch.where(body.com_vel[:, 1] > 0.0, 1.0, -1.0)
         self._side.copy_(torch.where(new, sway, torch.where(over, -self._side, self._side)))
 
+        most = cfg.acceleration * self.step_dt
+        velocity = self._velocity + (body.command - self._velocity).clamp(-most, most)
+        self._velocity.copy_(torch.where(new[:, None], body.com_vel[:, :2], velocity))
+
         # The integral of the speed error, once per step.
-        error = body.command - self._path / self._elapsed.clamp(min=self.step_dt)[:, None]
+        error = self._velocity - self._path / self._elapsed.clamp(min=self.step_dt)[:, None]
         speed = (self._speed + cfg.speed_gain * error).clamp(-cfg.speed_limit, cfg.speed_limit)
         self._speed.copy_(torch.where(over[:, None], speed, self._speed).masked_fill(new[:, None], 0.0))
 
@@ -172,7 +177,7 @@ class Walker:
             ang_mom=body.ang_mom[:, :2] + orbital,
         )
         time_left = cfg.step_time * (1.0 - self._phase)
-        step = Step(self._side, time_left, body.command + self._speed, cfg.step_time, cfg.step_width)
+        step = Step(self._side, time_left, self._velocity + self._speed, cfg.step_time, cfg.step_width)
         t_x, t_y = self.place(pendulum, step).unbind(1)
         # Without a hip yaw joint the robot turns by stepping further with one foot than with the other.
         t_x = t_x + self._side * (cfg.steering_gain * body.heading).clamp(-cfg.steering_limit, cfg.steering_limit)
