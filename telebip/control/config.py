@@ -47,3 +47,9 @@ def load_controller(name: str, overrides: Sequence[str] = ()) -> WalkerConfig:
         UserError: unknown or missing field, wrong type or a value out of bounds.
     """
     return load(ControllerConfig, f"control/{name}", overrides).control
+
+
+def split_overrides(overrides: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return a command line's overrides of the task and, apart, those of the controller, `control.key=value`."""
+    own = [override for override in overrides if override.startswith("control.")]
+    return [override for override in overrides if override not in own], own

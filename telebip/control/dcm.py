@@ -1,7 +1,7 @@
 """The DCM walker: foot placement from the divergent component of motion.
 
-J. Englsberger, C. Ott and A. Albu-Schaeffer, "Three-dimensional bipedal walking control based on divergent component of motion",
-IEEE Transactions on Robotics 31 (2015). Placing the foot at an offset from the predicted DCM: M. Khadiv et al., "Walking
+J. Englsberger, C. Ott and A. Albu-Schaeffer, "Three-dimensional bipedal walking control based on divergent component of
+motion", IEEE Transactions on Robotics 31 (2015). Placing the foot at an offset from the predicted DCM: M. Khadiv et al., "Walking
 control based on step timing adaptation", IEEE Transactions on Robotics 36 (2020), here at a fixed step time.
 """
 

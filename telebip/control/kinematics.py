@@ -34,7 +34,7 @@ class Motion:
 class Kinematics:
     """Centre of mass, its velocity, and centroidal angular momentum in closed form; exact for rigid links.
 
-    A leg's bodies move in three groups, the links: one turns with the hip's roll, one with roll and pitch, and one slides as well.
+    A leg's bodies move in three groups, the links: one turns with the hip's roll, one with roll and pitch, one slides as well.
     """
 
     def __init__(self, robot: Robot, device: torch.device) -> None:
