@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import yaml
 from omegaconf import MISSING, DictConfig, OmegaConf
@@ -23,6 +23,8 @@ CONFIGS = ROOT / "configs"
 
 Leaf = tuple[str, Any, str]
 """A field of a file or override: dotted key, value, and the place to name in errors, as "file:line"."""
+
+Schema = TypeVar("Schema")
 
 
 def quantity(unit: str = "", **bounds: float) -> Any:
@@ -201,13 +203,18 @@ def load_task(task: str | TaskConfig, overrides: Sequence[str] = ()) -> TaskConf
     Raises:
         UserError: unknown task, unreadable file, unknown or missing field, wrong type or a value out of bounds.
     """
+    return load(TaskConfig, task, overrides)
+
+
+def load(schema: type[Schema], source: str | Schema, overrides: Sequence[str] = ()) -> Schema:
+    """Do what `load_task` does for any dataclass of `quantity` and `section` fields; names are those of files in `configs/`."""
     origins: dict[str, str] = {}
-    if isinstance(task, TaskConfig):
-        config, task = OmegaConf.structured(task), "configuration"
-    else:
-        config = OmegaConf.structured(TaskConfig)
-        for leaves in _layers(task):
+    if isinstance(source, str):
+        config, name = OmegaConf.structured(schema), source
+        for leaves in _layers(source):
             _apply(config, leaves, origins)
+    else:
+        config, name = OmegaConf.structured(source), "configuration"
     for override in overrides:
         key, equals, value = override.partition("=")
         where = f"override '{override}'"
@@ -215,7 +222,7 @@ def load_task(task: str | TaskConfig, overrides: Sequence[str] = ()) -> TaskConf
             raise UserError(f"{where} is not of the form key.path=value")
         _, parsed = _load_yaml(value, where)
         _apply(config, [(key, parsed, where)], origins)
-    return _validate(config, origins, task)
+    return _validate(config, origins, name)
 
 
 def parse_config(text: str, source: str) -> TaskConfig:
@@ -305,7 +312,7 @@ def _leaves(node: Any, values: Any, source: str, prefix: str = "") -> Iterator[L
 def _apply(config: DictConfig, leaves: list[Leaf], origins: dict[str, str]) -> None:
     """Set the leaves one by one, so that an error knows its place; remember where each came from."""
     for key, value, where in leaves:
-        schema = _schema_of(key, where)
+        schema = _schema_of(OmegaConf.get_type(config), key, where)
         if dataclasses.is_dataclass(schema):
             names = ", ".join(f.name for f in dataclasses.fields(schema))
             raise UserError(f"{where}: {key} is a section; set one of its fields: {names}")
@@ -318,9 +325,8 @@ def _apply(config: DictConfig, leaves: list[Leaf], origins: dict[str, str]) -> N
         origins[key] = where
 
 
-def _schema_of(key: str, where: str) -> Any:
+def _schema_of(schema: Any, key: str, where: str) -> Any:
     """Return the type of a dotted key, or raise the error that names the nearest valid one."""
-    schema: Any = TaskConfig
     walked = ""
     for name in key.split("."):
         fields = {f.name: f for f in dataclasses.fields(schema)} if dataclasses.is_dataclass(schema) else {}
@@ -348,12 +354,12 @@ def _describe(value: Any) -> str:
     return text if len(text) <= 40 else text[:37] + "..."
 
 
-def _validate(config: DictConfig, origins: dict[str, str], source: str) -> TaskConfig:
+def _validate(config: DictConfig, origins: dict[str, str], source: str) -> Any:
     missing = OmegaConf.missing_keys(config)
     if missing:
         raise UserError(f"{source}: field '{min(missing)}' has no value")
-    task: TaskConfig = OmegaConf.to_object(config)  # type: ignore[assignment]
-    for key, value, meta in _values(task):
+    values = OmegaConf.to_object(config)
+    for key, value, meta in _values(values):
         where = origins.get(key, source)
         for entry in value if isinstance(value, tuple | list) else [value]:
             if isinstance(entry, float) and not math.isfinite(entry):
@@ -368,7 +374,7 @@ def _validate(config: DictConfig, origins: dict[str, str], source: str) -> TaskC
             raise UserError(f"{where}: {key} must be [low, high], got [{value[0]}, {value[1]}]")
         if value == []:
             raise UserError(f"{where}: {key} must not be empty")
-    return task
+    return values
 
 
 _BOUNDS = {

@@ -29,6 +29,17 @@ def rotate_inverse(quat: Tensor, vec: Tensor) -> Tensor:
     return vec - w * t + torch.linalg.cross(u, t)
 
 
+def matrix(quat: Tensor) -> Tensor:
+    """Return the rotation matrix, body to world, of the unit `quat` (..., 4); (..., 3, 3)."""
+    w, x, y, z = quat.unbind(-1)
+    rows = [
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+    ]
+    return torch.stack([entry for row in rows for entry in row], dim=-1).unflatten(-1, (3, 3))
+
+
 def yaw(quat: Tensor) -> Tensor:
     """Return the heading [rad] of the body's x axis projected on the ground, (...): atan2(R_10, R_00)."""
     w, x, y, z = quat.unbind(-1)

@@ -2,15 +2,13 @@
 """The environment: the order of one step, and what it promises to a learner."""
 
 import math
-from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
 import torch
 from rsl_rl.env import VecEnv
-from torch.utils._python_dispatch import TorchDispatchMode
-from worlds import LAST_ACTION, NEVER_FALL, PHASE, MakeEnv, observe, put, put_low, random_actions
+from worlds import LAST_ACTION, NEVER_FALL, PHASE, HostReads, MakeEnv, observe, put, put_low, random_actions
 
 from telebip.math import wrap_angle
 from telebip.mdp.rewards import REWARDS
@@ -329,25 +327,6 @@ def test_the_same_seed_gives_the_same_numbers_and_another_does_not(make_env: Mak
         assert torch.equal(dones_a, dones_b)
         ended += int(dones_a.sum())
     assert ended > 0  # resets are part of it
-
-
-class HostReads(TorchDispatchMode):
-    """Notes the operators that wait for the device, or whose result's shape depends on the data."""
-
-    OPERATORS = ("_local_scalar_dense", "item", "nonzero", "masked_select", "is_nonzero", "equal", "_unique2")
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.seen: list[str] = []
-
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        name = func.overloadpacket.__name__
-        boolean_index = name in ("index", "index_put", "index_put_") and any(
-            index is not None and index.dtype == torch.bool for index in args[1]
-        )
-        if name in self.OPERATORS or boolean_index:
-            self.seen.append(name)
-        return func(*args, **(kwargs or {}))
 
 
 def test_a_step_reads_nothing_back_to_the_host(make_env: MakeEnv) -> None:

@@ -1,9 +1,11 @@
-"""What tests do to worlds: act, observe, put robots into states."""
+"""What tests do to worlds: act, observe, put robots into states, watch the operators that a step runs."""
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from telebip.env import TelebipEnv
 
@@ -34,3 +36,22 @@ def put_low(env: TelebipEnv, worlds: list[int]) -> None:
     qpos = env.sim.state.qpos.clone()
     qpos[:, 2] = 0.3
     put(env, worlds, qpos, torch.zeros(env.num_envs, 12))
+
+
+class HostReads(TorchDispatchMode):
+    """Notes the operators that wait for the device, or whose result's shape depends on the data."""
+
+    OPERATORS = ("_local_scalar_dense", "item", "nonzero", "masked_select", "is_nonzero", "equal", "_unique2")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: list[str] = []
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        name = func.overloadpacket.__name__
+        boolean_index = name in ("index", "index_put", "index_put_") and any(
+            index is not None and index.dtype == torch.bool for index in args[1]
+        )
+        if name in self.OPERATORS or boolean_index:
+            self.seen.append(name)
+        return func(*args, **(kwargs or {}))

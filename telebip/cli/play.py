@@ -8,12 +8,14 @@ from pathlib import Path
 
 from telebip.cli.common import Parser, resolve_device
 from telebip.config import TaskConfig, load_task
+from telebip.control.config import split_overrides
 from telebip.errors import UserError
 
 EXAMPLES = """\
   play.py --checkpoint assets/policies/telebip_flat --record walk.rrd      (then: rerun walk.rrd)
   play.py --checkpoint runs/telebip_flat/2026-01-31_12-00-00 --command 0.7 0 0
   play.py --checkpoint assets/policies/telebip_flat --num-envs 64 --duration 20
+  play.py --controller alip --command 0.7 0 0 control.swing_height=0.05    (a model-based walker)
   play.py --agent zero --task telebip_flat --duration 3                    (what the robot does without a policy)
 """
 
@@ -30,7 +32,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         checkpoint = load_checkpoint(options.checkpoint)
         task, config, label = checkpoint.task, checkpoint.config, str(checkpoint.path)
     else:
-        task, config, label = Path(options.task).stem, load_task(options.task), f"agent '{options.agent}'"
+        who = f"controller '{options.controller}'" if options.controller else f"agent '{options.agent}'"
+        task, config, label = Path(options.task).stem, load_task(options.task), who
     command = _command(options.command, config)
     _play(options, task, _as_played(config, options), command, checkpoint, label)
 
@@ -54,6 +57,10 @@ def _play(options: argparse.Namespace, task: str, config: TaskConfig, command, c
         from telebip.rl.policy import load_policy
 
         policy = load_policy(checkpoint, device)
+    elif options.controller:
+        from telebip.control.factory import make_controller
+
+        policy = make_controller(options.controller, env, options.control_overrides)
     else:
         policy = _agent(options.agent, env)
     _warn_untrained(console, command, checkpoint)
@@ -142,8 +149,11 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = Parser("Walk a policy at a given command, measure it, and record it for the rerun viewer.", EXAMPLES)
     who = parser.add_mutually_exclusive_group()
     who.add_argument("--checkpoint", metavar="PATH_OR_RUN", help="a checkpoint file, or a run folder for its newest")
+    who.add_argument("--controller", choices=("alip", "dcm"), help="a model-based walker, see configs/control/")
     who.add_argument("--agent", choices=("zero", "random"), help="no policy: nominal joint targets, or Gaussian actions")
-    parser.add_argument("--task", metavar="NAME", default="telebip_flat", help="task of an --agent (default: telebip_flat)")
+    parser.add_argument(
+        "--task", metavar="NAME", default="telebip_flat", help="of an --agent or --controller (default: telebip_flat)"
+    )
     parser.add_argument(
         "--command",
         nargs=3,
@@ -158,10 +168,21 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--seed", metavar="S", help="of the initial states (default: the task's)")
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto, which prefers CUDA)")
     parser.add_argument("--backend", default="auto", choices=("auto", "native", "warp"), help="physics engine (default: auto)")
-    parser.add_argument("overrides", nargs="*", metavar="key.path=value", help="override any field of the task")
+    parser.add_argument(
+        "overrides",
+        nargs="*",
+        metavar="key.path=value",
+        help="override any field of the task, or control.key of a --controller",
+    )
     options = parser.parse(argv)
-    if not (options.checkpoint or options.agent):
-        raise UserError("what should walk? --checkpoint PATH_OR_RUN (try assets/policies/telebip_flat), or --agent zero|random")
+    if not (options.checkpoint or options.controller or options.agent):
+        raise UserError(
+            "what should walk? --checkpoint PATH_OR_RUN (try assets/policies/telebip_flat), --controller alip|dcm, "
+            "or --agent zero|random"
+        )
+    options.control_overrides = []
+    if options.controller:
+        options.overrides, options.control_overrides = split_overrides(options.overrides)
     if not 0.0 < options.duration <= 3600.0:
         raise UserError(f"--duration must be between 0 and 3600 s, got {options.duration:g}")
     if options.record and Path(options.record).suffix not in (".rrd", ".png"):

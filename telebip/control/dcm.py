@@ -1,0 +1,59 @@
+"""The DCM walker: foot placement from the divergent component of motion.
+
+J. Englsberger, C. Ott and A. Albu-Schaeffer, "Three-dimensional bipedal walking control based on divergent component of
+motion", IEEE Transactions on Robotics 31 (2015). Placing the foot at an offset from the predicted DCM: M. Khadiv et al., "Walking
+control based on step timing adaptation", IEEE Transactions on Robotics 36 (2020), here at a fixed step time.
+"""
+
+import torch
+from torch import Tensor
+
+from telebip.control.pendulum import Pendulum, Step
+
+
+def predict_dcm(pendulum: Pendulum, time: Tensor) -> Tensor:
+    r"""Divergent component of motion after `time`, relative to the present contact, xi(t) = (c + c' / w) e^{w t}.
+
+    Args:
+        pendulum: the present state, c = (x, y).
+        time: t [s], (num_envs,).
+
+    Returns:
+        xi [m], (num_envs, 2).
+    """
+    now = pendulum.pos + pendulum.vel / pendulum.rate[:, None]
+    return now * torch.exp(pendulum.rate * time)[:, None]
+
+
+def dcm_offset(rate: Tensor, step: Step) -> Tensor:
+    r"""Offset of the DCM from the new contact at touch-down that repeats from step to step.
+
+        b = (v_x T / (e^{w T} - 1), v_y T / (e^{w T} - 1) + s W / (1 + e^{w T}))
+
+    Over a step the offset grows by e^{w T} and the contact moves on by v T, and by W to the other side.
+
+    Args:
+        rate: w [1/s], (num_envs,).
+        step: the wanted walk.
+
+    Returns:
+        b [m], (num_envs, 2).
+    """
+    growth = torch.exp(rate * step.time)
+    offset = step.velocity * (step.time / (growth - 1.0))[:, None]
+    offset[:, 1] += step.side * step.width / (1.0 + growth)
+    return offset
+
+
+def foot_placement(pendulum: Pendulum, step: Step) -> Tensor:
+    r"""Touch down at the repeating offset from the DCM of that time, p = xi_T - b; t = p - c_T.
+
+    Args:
+        pendulum: the present state.
+        step: the present step and the wanted walk; touch-down is `step.time_left` away.
+
+    Returns:
+        Touch-down relative to the centre of mass then, (t_x, t_y) [m], (num_envs, 2).
+    """
+    contact = predict_dcm(pendulum, step.time_left) - dcm_offset(pendulum.rate, step)
+    return contact - pendulum.pos_after(step.time_left)

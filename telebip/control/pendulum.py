@@ -1,0 +1,52 @@
+"""The linear inverted pendulum: what both walkers predict with, and what they are told about the step."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Pendulum:
+    """A point mass at constant height over the stance foot's contact, in the plan frame (x along the heading, z up)."""
+
+    mass: float  # m [kg]
+    height: Tensor  # H, centre of mass above the contact [m], (num_envs,)
+    rate: Tensor  # w = sqrt(g / H) [1/s], (num_envs,)
+    pos: Tensor  # (x, y), centre of mass minus contact [m], (num_envs, 2)
+    vel: Tensor  # (v_x, v_y) of the centre of mass [m/s], (num_envs, 2)
+    ang_mom: Tensor  # (L_x, L_y) about the contact [kg m^2/s], (num_envs, 2)
+
+    def pos_after(self, time: Tensor) -> Tensor:
+        """Return (x, y) after `time` [s] (num_envs,): x cosh(w t) + (v_x / w) sinh(w t), likewise y; (num_envs, 2)."""
+        angle = self.rate * time
+        return self.pos * angle.cosh()[:, None] + self.vel * (angle.sinh() / self.rate)[:, None]
+
+
+@dataclass(frozen=True)
+class Step:
+    """The present step, and what the walk should become."""
+
+    side: Tensor  # s, +1 in left stance and -1 in right stance, (num_envs,)
+    time_left: Tensor  # r, until touch-down [s], (num_envs,)
+    velocity: Tensor  # wanted (v_x, v_y) [m/s], (num_envs, 2)
+    time: float  # T, of every step [s]
+    width: float  # W, lateral distance of the feet when walking in place [m]
+
+
+Placement = Callable[[Pendulum, Step], Tensor]
+"""A foot placement law: where to touch down, relative to the centre of mass at that time [m], (num_envs, 2)."""
+
+
+def mean_to_end_speed(rate: Tensor, time: float) -> Tensor:
+    r"""Speed at the end of a periodic step over its mean speed, (w T / 2) / tanh(w T / 2).
+
+    A pendulum that goes from -v T / 2 to v T / 2 in T is slowest in the middle.
+
+    Args:
+        rate: w [1/s], (num_envs,).
+        time: T [s].
+    """
+    half = 0.5 * time * rate
+    return half / torch.tanh(half)
