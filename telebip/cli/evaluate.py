@@ -39,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         worlds=options.num_envs,
         duration=options.duration,
         skip=min(5.0, 0.25 * options.duration),
-        commands=tuple(options.commands) if options.commands else None,
+        commands=options.commands,
         push=push,
         device=device,
         backend=options.backend,
@@ -118,6 +118,11 @@ def progress_bar(console):
     return bar()
 
 
+def speeds(text: str) -> tuple[float, ...]:
+    """Read `0.5,0.7`; argparse turns a ValueError into a refusal that quotes the text."""
+    return tuple(float(part) for part in text.split(","))
+
+
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = Parser(
         "Measure how something walks (tracking, energy, pushes, gait, learning) and report it beside the article's numbers.",
@@ -140,10 +145,9 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--duration", type=float, default=20.0, metavar="S", help="seconds of walking (default: 20)")
     parser.add_argument(
         "--commands",
-        type=float,
-        nargs="+",
-        metavar="VX",
-        help="forward speeds in m/s (default: 0.5 0.7 1.0 -0.3, where trained)",
+        type=speeds,
+        metavar="VX,VX",
+        help="forward speeds in m/s (default: 0.5,0.7,1.0,-0.3 as far as the policy was trained on them)",
     )
     parser.add_argument("--max-force", type=float, default=300.0, metavar="N", help="largest push tried in N (default: 300)")
     parser.add_argument("--push-worlds", type=int, default=32, metavar="N", help="worlds for each push (default: 32)")

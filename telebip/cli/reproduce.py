@@ -20,8 +20,8 @@ EXAMPLES = """\
 QUICK_TRAINING = ("num_envs=64", "ppo.max_iterations=2", "ppo.hidden_dims=[32,32]")
 SHIPPED = ROOT / "assets" / "policies"
 INTRODUCTION = (
-    "Reinforcement learning and two model-based walkers on one robot, measured by one evaluator; in grey, and in the last rows, "
-    "the article's own numbers, which belong to its own robot. Trainings: {trainings}. Every number comes from "
+    "Reinforcement learning and two model-based walkers on one robot, measured by one evaluator; in grey, and in the last "
+    "rows, the article's own numbers, which belong to its own robot. Trainings: {trainings}. Every number comes from "
     "`scripts/reproduce.py`."
 )
 
