@@ -79,8 +79,9 @@ def _play(options: argparse.Namespace, task: str, config: TaskConfig, command, c
         console.print(f"drew {options.record}")
     elif options.record:
         from telebip.viz.rerun import record
+        from telebip.viz.scene import line_up
 
-        record(rollout, robot.path.with_suffix(".urdf"), Path(options.record))
+        record(line_up([("robot", rollout)], worlds=4), robot.path.with_suffix(".urdf"), Path(options.record))
         console.print(f"recorded {options.record}; look at it with: rerun {options.record}")
 
 

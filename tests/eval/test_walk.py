@@ -44,7 +44,7 @@ def walk(steps: int = 200, worlds: int = 2, **replaced: Any) -> Rollout:
         if name in replaced:
             array[...] = replaced[name]
         arrays[name] = array
-    return Rollout(step_dt=STEP_DT, weight=WEIGHT, **arrays)
+    return Rollout(step_dt=STEP_DT, weight=WEIGHT, reward_terms={}, **arrays)
 
 
 def velocity(forward: float, left: float = 0.0) -> NDArray[np.floating]:
@@ -140,6 +140,8 @@ def test_a_rollout_of_real_worlds(make_env: Callable[..., TelebipEnv]) -> None:
     }
     for name, shape in shapes.items():
         assert getattr(rollout, name).shape == (15, 4, *shape), name
+    assert all(terms.shape == (15, 4) for terms in rollout.reward_terms.values())
+    np.testing.assert_allclose(sum(rollout.reward_terms.values()), rollout.reward, atol=1e-6)
     assert not rollout.fallen.any()  # time-outs are no falls
     np.testing.assert_array_equal(rollout.qpos[-1], env.sim.state.qpos.numpy())
     assert np.ptp(rollout.qpos[:, :, 9], axis=0).min() > 0.0  # rows are copies, not one live buffer

@@ -1,0 +1,37 @@
+"""Who is seen: robots side by side, from any number of rollouts."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from telebip.eval.rollout import Rollout
+
+LANE = 0.9  # m between robots side by side
+
+
+@dataclass(frozen=True)
+class Walker:
+    """One world of a rollout, on a lane of its own."""
+
+    label: str
+    rollout: Rollout
+    world: int
+    lane: float = 0.0  # how far it is moved along y [m]
+
+
+def line_up(rollouts: Sequence[tuple[str, Rollout]], worlds: int = 1) -> list[Walker]:
+    """Place the first `worlds` worlds of every labelled rollout side by side, from left to right, centred.
+
+    Args:
+        rollouts: what happened, each with the name it is shown under: policies that walked the same command, say.
+        worlds: how many of each at most.
+    """
+    places = [(label, rollout, i) for label, rollout in rollouts for i in range(min(worlds, rollout.qpos.shape[1]))]
+    return [
+        Walker(
+            label=label if rollout.qpos.shape[1] == 1 or worlds == 1 else f"{label} {world + 1}",
+            rollout=rollout,
+            world=world,
+            lane=LANE * (0.5 * (len(places) - 1) - i),
+        )
+        for i, (label, rollout, world) in enumerate(places)
+    ]
