@@ -1,9 +1,7 @@
 """Recordings of walks for the rerun viewer: the robots in 3D beside their time series, logged in columns."""
 
-import os
 import re
 import socket
-import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,12 +15,10 @@ from rerun.blueprint import Blueprint
 from telebip.errors import UserError
 from telebip.robot import FEET, TRUNK
 from telebip.viz.blueprint import walk_layout
-from telebip.viz.scene import Walker
-from telebip.viz.series import PALETTE, SHARED, TOTAL, Color, plots
+from telebip.viz.opengl import has_display
+from telebip.viz.scene import ACTUAL, COMMAND, FORCE_SCALE, GROUND_FORCE, PUSH, PUSH_SCALE, SPEED_SCALE, Color, Walker
+from telebip.viz.series import PALETTE, SHARED, TOTAL, plots
 from telebip.viz.urdf import Array, joint_transforms, link_mesh, link_paths, link_poses, load_urdf
-
-FORCE_SCALE, PUSH_SCALE, SPEED_SCALE = 0.001, 0.006, 0.5  # m of arrow per N, per N, and per m/s
-GROUND_FORCE, PUSH, COMMAND, ACTUAL = (60, 230, 130), (230, 40, 40), (110, 110, 120), (250, 190, 50)
 
 
 def record(walkers: Sequence[Walker], urdf: Path, file: Path) -> None:
@@ -79,11 +75,6 @@ def viewer(layout: Blueprint, address: str | None) -> Iterator[rr.RecordingStrea
         yield stream
     finally:
         stream.disconnect()
-
-
-def has_display() -> bool:
-    """Whether a window can be opened, as far as the environment says."""
-    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def log_walks(stream: rr.RecordingStream, walkers: Sequence[Walker], robot: yourdfpy.URDF) -> None:

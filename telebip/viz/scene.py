@@ -1,4 +1,4 @@
-"""Who is seen: robots side by side, from any number of rollouts."""
+"""Who is seen: robots side by side, from any number of rollouts; and how long and in which colour arrows are drawn."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,6 +6,10 @@ from dataclasses import dataclass
 from telebip.eval.rollout import Rollout
 
 LANE = 0.9  # m between robots side by side
+
+Color = tuple[int, int, int]
+FORCE_SCALE, PUSH_SCALE, SPEED_SCALE = 0.001, 0.006, 0.5  # m of arrow per N, per N, and per m/s
+GROUND_FORCE, PUSH, COMMAND, ACTUAL = (60, 230, 130), (230, 40, 40), (110, 110, 120), (250, 190, 50)
 
 
 @dataclass(frozen=True)
@@ -28,7 +32,7 @@ def line_up(rollouts: Sequence[tuple[str, Rollout]], worlds: int = 1) -> list[Wa
     places = [(label, rollout, i) for label, rollout in rollouts for i in range(min(worlds, rollout.qpos.shape[1]))]
     return [
         Walker(
-            label=label if rollout.qpos.shape[1] == 1 or worlds == 1 else f"{label} {world + 1}",
+            label=label if min(worlds, rollout.qpos.shape[1]) == 1 else f"{label} {world + 1}",
             rollout=rollout,
             world=world,
             lane=LANE * (0.5 * (len(places) - 1) - i),

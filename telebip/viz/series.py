@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from telebip.eval.rollout import Rollout
 from telebip.eval.walk import heading_velocity
 from telebip.robot import FEET, JOINTS
+from telebip.viz.scene import Color
 
 Array = NDArray[np.floating]
-Color = tuple[int, int, int]
 
 RIGHT, LEFT, COMMAND, TOTAL = (235, 110, 80), (80, 160, 235), (170, 170, 170), (240, 200, 80)
 PALETTE: tuple[Color, ...] = (TOTAL, (90, 200, 130), (80, 160, 235), (235, 110, 80), (190, 120, 220), (140, 220, 220))
@@ -97,13 +97,14 @@ def running_cost_of_transport(power: Array, velocity: Array, weight: float, wind
     Returns:
         Cost of transport [-], (steps,); NaN below `slowest`, and until the first window is full: the robot gathers speed.
     """
-
-    def mean(values: Array) -> Array:
-        sums = np.concatenate([np.zeros_like(values[:1], dtype=float), np.cumsum(values, axis=0, dtype=float)])
-        last = np.arange(1, len(values) + 1)
-        first = np.maximum(last - window, 0)
-        return ((sums[last] - sums[first]).T / (last - first)).T
-
-    speed = np.linalg.norm(mean(velocity), axis=-1)
+    speed = np.linalg.norm(running_mean(velocity, window), axis=-1)
     moving = (speed >= slowest) & (np.arange(len(speed)) >= window - 1)
-    return np.where(moving, mean(power) / (weight * np.where(moving, speed, 1.0)), np.nan)
+    return np.where(moving, running_mean(power, window) / (weight * np.where(moving, speed, 1.0)), np.nan)
+
+
+def running_mean(values: Array, window: int) -> Array:
+    """Return the mean of the latest `window` rows, or of as many as there are, for every row of `values` (steps, ...)."""
+    sums = np.concatenate([np.zeros_like(values[:1], dtype=float), np.cumsum(values, axis=0, dtype=float)])
+    last = np.arange(1, len(values) + 1)
+    first = np.maximum(last - window, 0)
+    return ((sums[last] - sums[first]).T / (last - first)).T

@@ -14,7 +14,7 @@ from telebip.rl.checkpoint import load_checkpoint
 from telebip.rl.policy import load_policy
 from telebip.robot import Robot
 
-STEPS = 100  # 2 s
+STEPS, STANDING_STEPS = 100, 20  # 2 s and 0.4 s
 
 
 @pytest.fixture(scope="session")
@@ -36,4 +36,4 @@ def walking(robot: Robot) -> Rollout:
 def standing(robot: Robot) -> Rollout:
     """One world that holds the nominal pose."""
     env = TelebipEnv(load_task("telebip_flat", ["num_envs=1", "episode.reset_heading=0"]), robot, "cpu", "native")
-    return roll_out(env, Stateless(lambda obs: torch.zeros(1, 6)), STEPS)
+    return roll_out(env, Stateless(lambda obs: torch.zeros(1, 6)), STANDING_STEPS)
