@@ -39,7 +39,7 @@ def strobe(
     azimuth = float(np.degrees(np.arctan2(along[1], along[0]))) + 108.0
     with Renderer(robot, size, extent=2.0 + 2.0 * span, shadow_size=4096) as renderer:
         renderer.look_at([*centre, 0.4], distance=1.0 + 0.5 * span, azimuth=azimuth, elevation=-9.0)
-        renderer.place(rows)
+        renderer.place(list(rows))
         picture = Image.fromarray(renderer.render())
     try:
         file.parent.mkdir(parents=True, exist_ok=True)

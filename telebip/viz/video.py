@@ -5,6 +5,7 @@ from pathlib import Path
 
 import av
 import numpy as np
+from av.error import FFmpegError
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
@@ -51,7 +52,7 @@ def film(
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         write(pictures(), file)
-    except (OSError, av.error.FFmpegError) as error:
+    except (OSError, FFmpegError) as error:
         raise UserError(f"cannot write film '{file}': {error}") from error
 
 

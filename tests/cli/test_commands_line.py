@@ -48,7 +48,10 @@ def refusal(script: str, *arguments: str) -> str:
         ([TRAIN, "--task", "telebip_flat", "--num-env", "8"], ["--num-env", "did you mean '--num-envs'?"]),
         ([TRAIN], ["--task", "telebip_flat"]),
         ([PLAY, "--agent", "zero", "--duration", "-1"], ["--duration", "-1"]),
-        ([PLAY, "--agent", "zero", "--record", "foo.txt"], ["--record", "foo.txt", ".rrd"]),
+        ([PLAY, "--agent", "zero", "--record", "foo.txt"], ["--record", "foo.txt", ".rrd", ".mp4"]),
+        ([PLAY, "--agent", "zero", "--show", "0"], ["--show", "at least 1"]),
+        ([PLAY, "--agent", "zero", "--connect", "localhost"], ["--connect", "--viewer rerun"]),
+        ([PLAY, "--agent", "zero", "--viewer", "mujco"], ["--viewer", "mujco", "mujoco"]),
     ],
     ids=lambda value: " ".join(value[1:]) if value[0] in (TRAIN, PLAY) else "",
 )
@@ -113,8 +116,11 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_trained_policy_can_be_played_and_recorded(run_dir: Path) -> None:
     assert {"model_2.pt", "policy.pt", "config.yaml", "run.json"} <= {path.name for path in run_dir.iterdir()}
     record = run_dir / "walk.rrd"
-    text = ran(PLAY, "--checkpoint", str(run_dir), "--duration", "1", "--record", str(record), "--device", "cpu")
-    assert "telebip_slow, 1 world x 1 s" in text
+    others = ("--beside", "zero", "random")
+    text = ran(PLAY, "--checkpoint", str(run_dir), "--duration", "1", "--record", str(record), "--device", "cpu", *others)
+    assert "model_2.pt: telebip_slow, 1 world x 1 s" in text
+    assert "agent 'zero': telebip_slow, 1 world x 1 s" in text
+    assert "agent 'random': telebip_slow, 1 world x 1 s" in text
     assert "0.55 m/s forward" in text  # the middle of telebip_slow's 0.4 to 0.7
     assert record.stat().st_size > 10_000
 

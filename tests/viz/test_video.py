@@ -41,7 +41,7 @@ def mp4(opengl_works: None, walking: Rollout, robot: Robot, tmp_path_factory: py
         stream = container.streams.video[0]
         assert stream.average_rate == 25
         assert container.duration is not None and container.duration / 1e6 == pytest.approx(2.0, abs=0.05)
-        return [frame.to_ndarray(format="rgb24") for frame in container.decode(stream)]
+        return [np.asarray(frame.to_image()) for frame in container.decode(stream)]
 
 
 def orange(frame: NDArray[np.uint8]) -> NDArray[np.bool_]:
