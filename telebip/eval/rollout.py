@@ -12,7 +12,6 @@ from torch import Tensor
 from telebip.config import TaskConfig, load_task
 from telebip.control.policy import Policy
 from telebip.env import TelebipEnv
-from telebip.mdp.rewards import REWARDS
 from telebip.sim import SimState
 
 
@@ -34,7 +33,7 @@ class Rollout:
     command: NDArray[np.float32]  # (steps, num_envs, 3): the target command, without the heading hold [m/s, m/s, rad/s]
     reference_heading: NDArray[np.float32]  # (steps, num_envs) [rad]
     reward: NDArray[np.float32]  # (steps, num_envs)
-    reward_terms: dict[str, NDArray[np.float32]]  # (steps, num_envs) each, by the names of `REWARDS`; their sum is `reward`
+    reward_terms: NDArray[np.float32]  # (steps, num_envs, terms), in the order of `REWARDS`; their sum is `reward`
     fallen: NDArray[np.bool_]  # (steps, num_envs): the episode ended here by a fall or a fault
 
     @property
@@ -86,11 +85,10 @@ def roll_out(env: TelebipEnv, policy: Policy, steps: int, progress: Callable[[in
                 "phase": env.phase,
                 "reference_heading": env.reference_heading,
                 "push_w": env.push_wrench_w[:, :3],
-                **{f"reward_{name}": terms for name, terms in zip(REWARDS, env.reward_terms, strict=True)},
+                "reward_terms": env.reward_terms.T,
             }
             rows.append({name: value.clone() for name, value in row.items()})
             rows[-1] |= {"command": command, "reward": reward, "fallen": dones & ~extras["time_outs"]}
             progress(step + 1)
     arrays = {name: torch.stack([row[name] for row in rows]).cpu().numpy() for name in rows[0]}
-    reward_terms = {name: arrays.pop(f"reward_{name}") for name in REWARDS}
-    return Rollout(step_dt=env.step_dt, weight=env.robot.weight, reward_terms=reward_terms, **arrays)
+    return Rollout(step_dt=env.step_dt, weight=env.robot.weight, **arrays)

@@ -28,6 +28,7 @@ def walk_layout(robots: Sequence[str], titles: dict[str, str]) -> rrb.Blueprint:
             + [f"- /plot/{robot}/{name}/command" for robot in shown[1:]],  # it would be drawn over the first one's
             plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop),
             time_ranges=None if whole else AROUND_THE_CURSOR,
+            axis_y=rrb.ScalarAxis(range=(0.0, 1.5)) if name == "cost_of_transport" else None,  # a start costs far more
         )
 
     def details(robot: str, name: str | None = None) -> rrb.Vertical:

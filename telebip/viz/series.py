@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from telebip.eval.rollout import Rollout
 from telebip.eval.walk import heading_velocity
+from telebip.mdp.rewards import REWARDS
 from telebip.robot import FEET, JOINTS
 from telebip.viz.scene import Color
 
@@ -59,14 +60,14 @@ def plots(rollout: Rollout, world: int) -> dict[str, Plot]:
     hips = [i for i, name in enumerate(JOINTS) if not name.endswith("knee")]
     knees = [i for i, name in enumerate(JOINTS) if name.endswith("knee")]
     shades = ((235, 110, 80), (250, 180, 90), (80, 160, 235), (110, 220, 210))
-    terms = {name: values[:, world] for name, values in rollout.reward_terms.items()}
+    terms = zip(REWARDS, rollout.reward_terms[:, world].T, strict=True)
     return {
         "speed": Plot("speed [m/s]", {"command": Curve(command[:, 0], COMMAND), "forward": Curve(velocity[:, 0], TOTAL)}),
         "side_speed": Plot(
             "speed to the left [m/s]", {"command": Curve(command[:, 1], COMMAND), "left": Curve(velocity[:, 1], TOTAL)}
         ),
         "yaw_rate": Plot("yaw rate [rad/s]", {"command": Curve(command[:, 2], COMMAND), "trunk": Curve(yaw_rate, TOTAL)}),
-        "gait": Plot("phase signals, foot forces / weight", pair(phase, ("p_r", "p_l"), 0.7) | pair(load, FEET)),
+        "gait": Plot("phase, foot force / weight", pair(phase, ("p_r", "p_l"), 0.7) | pair(load, FEET)),
         "hip_pitch": joint("hip_pitch"),
         "hip_roll": joint("hip_roll"),
         "knee": joint("knee"),
@@ -77,7 +78,7 @@ def plots(rollout: Rollout, world: int) -> dict[str, Plot]:
         "reward": Plot(
             "reward per step",
             {
-                **{name: Curve(values, PALETTE[1 + i % 5]) for i, (name, values) in enumerate(terms.items())},
+                **{name: Curve(values, PALETTE[1 + i % 5]) for i, (name, values) in enumerate(terms)},
                 "total": Curve(rollout.reward[:, world], TOTAL),
             },
         ),

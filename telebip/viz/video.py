@@ -26,6 +26,7 @@ def film(
     robot: Robot,
     file: Path,
     size: tuple[int, int] | None = None,
+    start: float = 0.0,
     progress: Callable[[int, int], None] = lambda frame, total: None,
 ) -> None:
     """Film walks in real time.
@@ -35,13 +36,14 @@ def film(
         robot: their model.
         file: `.mp4` (H.264) or `.gif`; its folder is made.
         size: width and height [pixels], even numbers; 960 x 540, and half of it for a GIF, if not given.
+        start: what was before is not filmed, but counts in the means over the last second [s].
         progress: called with the number of finished frames and of all.
 
     Raises:
         UserError: there is no OpenGL to render with, or the file cannot be written.
     """
     size = size or ((480, 270) if file.suffix == ".gif" else (960, 540))
-    rows = frame_rows(walkers[0].rollout.time)
+    rows = frame_rows(walkers[0].rollout.time, start)
 
     def pictures() -> Iterator[Image.Image]:
         for i, picture in enumerate(_pictures(walkers, robot, rows, size)):
@@ -56,9 +58,9 @@ def film(
         raise UserError(f"cannot write film '{file}': {error}") from error
 
 
-def frame_rows(time: Array) -> NDArray[np.integer]:
+def frame_rows(time: Array, start: float = 0.0) -> NDArray[np.integer]:
     """Return the rows of a rollout that are filmed, so that it runs in real time: those nearest to the times of the frames."""
-    frames = np.arange(1, int(time[-1] * FPS + 1e-6) + 1)
+    frames = np.arange(int(start * FPS + 1e-6) + 1, int(time[-1] * FPS + 1e-6) + 1)
     return np.abs(time[None] - frames[:, None] / FPS).argmin(1) if len(frames) else np.array([len(time) - 1])
 
 

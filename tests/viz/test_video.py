@@ -114,6 +114,7 @@ def test_an_arrow_ends_where_the_camera_sees_its_ends(opengl_works: None, robot:
 def test_frames_are_taken_in_real_time() -> None:
     time = 0.02 * np.arange(1, 51)
     np.testing.assert_array_equal(frame_rows(time), np.arange(1, 50, 2))  # 0.04 s, 0.08 s, ...
+    np.testing.assert_array_equal(frame_rows(time, start=0.8), np.arange(41, 50, 2))  # 0.84 s, ...
     np.testing.assert_array_equal(frame_rows(time[:1]), [0])
 
 
