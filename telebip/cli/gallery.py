@@ -58,20 +58,20 @@ class Gallery:
         env = TelebipEnv(config, self.robot, "cpu", "native")
         env.set_command(*command)
         self.rollout = roll_out(env, load_policy(self.checkpoint, "cpu"), round(10.0 / env.step_dt))
-        self.walkers = line_up([("policy", self.rollout)])
+        self.actors = line_up([("policy", self.rollout)])
 
     def walking(self, file: Path) -> None:
         """Eight strides as a GIF."""
         from telebip.viz.video import film
 
         seconds = 8 * self.checkpoint.config.gait.period
-        film(self.walkers, self.robot, file, size=(560, 315), start=self.rollout.time[-1] - seconds)
+        film(self.actors, self.robot, file, size=(560, 315), start=self.rollout.time[-1] - seconds)
 
     def strides(self, file: Path) -> None:
         """The robot at equal intervals in one picture."""
         from telebip.viz.picture import strobe
 
-        strobe(self.walkers[0], self.robot, file)
+        strobe(self.actors[0], self.robot, file)
         _shrink(file)
 
     def joints(self, file: Path) -> None:
@@ -91,7 +91,7 @@ class Gallery:
         """Speed, feet, joints, power and rewards over one and a half seconds."""
         from telebip.viz.drawing import draw_stride
 
-        _save(draw_stride(self.walkers[0]), file)
+        _save(draw_stride(self.actors[0]), file)
 
     def learning(self, file: Path) -> str | None:
         """The learning curves, if they came with the policy."""
@@ -115,7 +115,7 @@ class Gallery:
             return "left as it is: no display; on Debian, apt-get install xvfb mesa-vulkan-drivers"
         with TemporaryDirectory() as folder:
             rrd, shot = Path(folder) / "walk.rrd", Path(folder) / "shot.png"
-            walking = [replace(self.walkers[0], rollout=self.rollout.after(2.16))]  # mid-stance when the shot is taken
+            walking = [replace(self.actors[0], rollout=self.rollout.after(2.16))]  # mid-stance when the shot is taken
             record(walking, self.robot.path.with_suffix(".urdf"), rrd)
             viewed = [str(viewer), str(rrd), "--port", "auto", "--window-size", "1500x900", "--screenshot-to", str(shot)]
             subprocess.run([*screen, *viewed], capture_output=True, timeout=180, env={"XDG_RUNTIME_DIR": folder, **os.environ})

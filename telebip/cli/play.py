@@ -69,7 +69,7 @@ def _play(options: argparse.Namespace, task: str, config: TaskConfig, command, c
         with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
             walking = bar.add_task(f"{name} walks", total=steps)
             rollout = roll_out(env, policy, steps, progress=lambda step, b=bar, w=walking: b.update(w, completed=step))
-        rollouts.append((name, rollout))
+        rollouts.append((name.upper() if name in CONTROLLERS else name, rollout))
         summary = summarise(rollout, skip=min(5.0, 0.25 * options.duration))
         who = checkpoint.path if name == "RL" else f"{'agent' if name in AGENTS else 'controller'} '{name}'"
         console.print(f"{who}: {task}, {summary.worlds} world{'s' if summary.worlds > 1 else ''} x {summary.duration:g} s")
@@ -83,29 +83,29 @@ def _show(console, options: argparse.Namespace, rollouts, robot) -> None:
 
     from telebip.viz.scene import line_up
 
-    walkers, urdf = line_up(rollouts, worlds=options.show), robot.path.with_suffix(".urdf")
+    actors, urdf = line_up(rollouts, worlds=options.show), robot.path.with_suffix(".urdf")
     file = Path(options.record) if options.record else None
     if file and file.suffix == ".rrd":
         from telebip.viz.rerun import record
 
-        record(walkers, urdf, file)
+        record(actors, urdf, file)
         console.print(f"recorded {file}; look at it with: rerun {file}")
     elif file and file.suffix == ".png":
         from telebip.viz.picture import strobe
 
-        strobe(walkers[0], robot, file)
+        strobe(actors[0], robot, file)
         console.print(f"drew {file}")
     elif file:
         from telebip.viz.video import film
 
         with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
             filming = bar.add_task("filming")
-            film(walkers, robot, file, progress=lambda frame, total: bar.update(filming, completed=frame, total=total))
+            film(actors, robot, file, progress=lambda frame, total: bar.update(filming, completed=frame, total=total))
         console.print(f"filmed {file}")
     if options.viewer == "rerun":
         from telebip.viz.rerun import show
 
-        show(walkers, urdf, options.connect)
+        show(actors, urdf, options.connect)
         console.print("shown in the rerun viewer")
 
 

@@ -15,7 +15,7 @@ from telebip.mdp.observations import LAYOUT
 from telebip.mdp.rewards import REWARDS
 from telebip.robot import JOINTS, Robot
 from telebip.viz.render import Array, Renderer
-from telebip.viz.scene import Walker
+from telebip.viz.scene import Actor
 from telebip.viz.series import plots
 
 INK = (35, 40, 50)
@@ -119,12 +119,12 @@ def draw_control_loop(config: TaskConfig, robot: Robot) -> Figure:
     return figure
 
 
-def draw_stride(walker: Walker, seconds: float = 1.5) -> Figure:
+def draw_stride(actor: Actor, seconds: float = 1.5) -> Figure:
     """Plot the last `seconds` of a walk: speed, feet, knees, hips, power."""
-    rollout = walker.rollout
+    rollout = actor.rollout
     rows = slice(-round(seconds / rollout.step_dt), None)
     time = rollout.time[rows] - rollout.time[rows][0]
-    shown = plots(rollout, walker.world)
+    shown = plots(rollout, actor.world)
     with plt.rc_context(STYLE):
         names = ("speed", "gait", "hip_pitch", "knee", "power", "reward")
         figure, grid = plt.subplots(3, 2, figsize=(9.6, 6.0), sharex=True, layout="constrained")

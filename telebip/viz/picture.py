@@ -8,11 +8,11 @@ from PIL import Image
 from telebip.errors import UserError
 from telebip.robot import Robot
 from telebip.viz.render import Renderer
-from telebip.viz.scene import Walker
+from telebip.viz.scene import Actor
 
 
 def strobe(
-    walker: Walker,
+    actor: Actor,
     robot: Robot,
     file: Path,
     interval: float = 0.55,
@@ -22,7 +22,7 @@ def strobe(
     """Render the last `poses` poses of a walk, `interval` apart, side by side as they stood on the ground.
 
     Args:
-        walker: who walked.
+        actor: who walked.
         robot: its model.
         file: an image file; the suffix decides the format.
         interval: time between poses [s]; a multiple of the gait period would freeze the legs, so it should not be one.
@@ -32,8 +32,8 @@ def strobe(
     Raises:
         UserError: there is no OpenGL to render with, or the file cannot be written.
     """
-    stride = max(1, round(interval / walker.rollout.step_dt))
-    rows = walker.rollout.qpos[::-1, walker.world][: stride * poses : stride][::-1].astype(float)
+    stride = max(1, round(interval / actor.rollout.step_dt))
+    rows = actor.rollout.qpos[::-1, actor.world][: stride * poses : stride][::-1].astype(float)
     centre, along = rows[:, :2].mean(0), rows[-1, :2] - rows[0, :2]
     span = float(np.linalg.norm(along))
     azimuth = float(np.degrees(np.arctan2(along[1], along[0]))) + 108.0

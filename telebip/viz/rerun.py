@@ -16,16 +16,16 @@ from telebip.errors import UserError
 from telebip.robot import FEET, TRUNK
 from telebip.viz.blueprint import walk_layout
 from telebip.viz.opengl import has_display
-from telebip.viz.scene import ACTUAL, COMMAND, FORCE_SCALE, GROUND_FORCE, PUSH, PUSH_SCALE, SPEED_SCALE, Color, Walker
+from telebip.viz.scene import ACTUAL, COMMAND, FORCE_SCALE, GROUND_FORCE, PUSH, PUSH_SCALE, SPEED_SCALE, Actor, Color
 from telebip.viz.series import PALETTE, SHARED, TOTAL, plots
 from telebip.viz.urdf import Array, joint_transforms, link_mesh, link_paths, link_poses, load_urdf
 
 
-def record(walkers: Sequence[Walker], urdf: Path, file: Path) -> None:
+def record(actors: Sequence[Actor], urdf: Path, file: Path) -> None:
     """Write walks to a `.rrd` file, with a prepared layout.
 
     Args:
-        walkers: who walked, from `telebip.viz.scene.line_up`.
+        actors: who walked, from `telebip.viz.scene.line_up`.
         urdf: the robot; its joints carry the names of `telebip.robot.JOINTS`.
         file: where to write; its folder is made.
 
@@ -39,20 +39,20 @@ def record(walkers: Sequence[Walker], urdf: Path, file: Path) -> None:
     except OSError as error:
         raise UserError(f"cannot write recording '{file}': {error.strerror or error}") from error
     stream = rr.RecordingStream("telebip", recording_id=file.stem)
-    stream.save(file, default_blueprint=_layout(walkers))
-    log_walks(stream, walkers, robot)
+    stream.save(file, default_blueprint=_layout(actors))
+    log_walks(stream, actors, robot)
     stream.disconnect()
 
 
-def show(walkers: Sequence[Walker], urdf: Path, address: str | None = None) -> None:
+def show(actors: Sequence[Actor], urdf: Path, address: str | None = None) -> None:
     """Show walks in a rerun viewer: in the one at `address`, or else in one on this machine, started if there is none.
 
     Raises:
         UserError: as `record`, or there is no viewer at `address`, or no display for one here.
     """
     robot = load_urdf(urdf)
-    with viewer(_layout(walkers), address) as stream:
-        log_walks(stream, walkers, robot)
+    with viewer(_layout(actors), address) as stream:
+        log_walks(stream, actors, robot)
 
 
 @contextmanager
@@ -77,21 +77,25 @@ def viewer(layout: Blueprint, address: str | None) -> Iterator[rr.RecordingStrea
         stream.disconnect()
 
 
-def log_walks(stream: rr.RecordingStream, walkers: Sequence[Walker], robot: yourdfpy.URDF) -> None:
+def log_walks(stream: rr.RecordingStream, actors: Sequence[Actor], robot: yourdfpy.URDF) -> None:
     """Log robots below `world/<name>`, and their series below `plot/<name>`."""
     stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    several = len(walkers) > 1
-    for i, (name, walker) in enumerate(zip(names(walkers), walkers, strict=True)):
-        time = rr.TimeColumn("time", duration=walker.rollout.time)
-        _log_shape(stream, robot, f"world/{name}", walker, several)
-        _log_motion(stream, robot, f"world/{name}", walker, time)
-        _log_arrows(stream, robot, f"world/{name}", walker, time)
-        _log_series(stream, f"plot/{name}", walker, time, PALETTE[i % len(PALETTE)], several)
+    several = len(actors) > 1
+    for i, (name, actor) in enumerate(zip(names(actors), actors, strict=True)):
+        time = rr.TimeColumn("time", duration=actor.rollout.time)
+        _log_shape(stream, robot, f"world/{name}", actor, several)
+        _log_motion(stream, robot, f"world/{name}", actor, time)
+        _log_arrows(stream, robot, f"world/{name}", actor, time)
+        _log_series(stream, f"plot/{name}", actor, time, PALETTE[i % len(PALETTE)], several)
 
 
-def names(walkers: Sequence[Walker]) -> list[str]:
-    """Return the walkers' labels as names of entities."""
-    return [re.sub(r"\W+", "_", walker.label) for walker in walkers]
+def names(actors: Sequence[Actor]) -> list[str]:
+    """Return the actors' labels as names of entities, each once."""
+    found: list[str] = []
+    for actor in actors:
+        name = re.sub(r"\W+", "_", actor.label)
+        found.append(f"{name}_{len(found) + 1}" if name in found else name)
+    return found
 
 
 def log_mesh(stream: rr.RecordingStream, path: str, robot: yourdfpy.URDF, link: str) -> None:
@@ -107,18 +111,18 @@ def log_mesh(stream: rr.RecordingStream, path: str, robot: yourdfpy.URDF, link: 
         stream.log(path, shape, static=True)
 
 
-def _log_shape(stream: rr.RecordingStream, robot: yourdfpy.URDF, root: str, walker: Walker, several: bool) -> None:
-    stream.log(root, rr.Transform3D(translation=[0.0, walker.lane, 0.0]), static=True)
+def _log_shape(stream: rr.RecordingStream, robot: yourdfpy.URDF, root: str, actor: Actor, several: bool) -> None:
+    stream.log(root, rr.Transform3D(translation=[0.0, actor.lane, 0.0]), static=True)
     for link, path in link_paths(robot).items():
         log_mesh(stream, f"{root}/{path}", robot, link)
     if several:
-        label = rr.Points3D([[0.0, 0.0, 0.4]], radii=0.005, colors=[250, 250, 250], labels=[walker.label], show_labels=True)
+        label = rr.Points3D([[0.0, 0.0, 0.4]], radii=0.005, colors=[250, 250, 250], labels=[actor.label], show_labels=True)
         stream.log(f"{root}/{TRUNK}/label", label, static=True)
 
 
-def _log_motion(stream: rr.RecordingStream, robot: yourdfpy.URDF, root: str, walker: Walker, time: rr.TimeColumn) -> None:
+def _log_motion(stream: rr.RecordingStream, robot: yourdfpy.URDF, root: str, actor: Actor, time: rr.TimeColumn) -> None:
     """Log the trunk's pose in the lane, and every link's in its parent's."""
-    qpos, paths = walker.rollout.qpos[:, walker.world], link_paths(robot)
+    qpos, paths = actor.rollout.qpos[:, actor.world], link_paths(robot)
     quat_xyzw = np.roll(qpos[:, 3:7], -1, axis=1)
     trunk = rr.Transform3D.columns(translation=qpos[:, :3], quaternion=quat_xyzw)
     stream.send_columns(f"{root}/{TRUNK}", indexes=[time], columns=trunk)
@@ -127,9 +131,9 @@ def _log_motion(stream: rr.RecordingStream, robot: yourdfpy.URDF, root: str, wal
         stream.send_columns(f"{root}/{paths[link]}", indexes=[time], columns=columns)
 
 
-def _log_arrows(stream: rr.RecordingStream, robot: yourdfpy.URDF, root: str, walker: Walker, time: rr.TimeColumn) -> None:
+def _log_arrows(stream: rr.RecordingStream, robot: yourdfpy.URDF, root: str, actor: Actor, time: rr.TimeColumn) -> None:
     """Log ground forces at the feet, the push on the trunk, and above it the commanded and the actual velocity."""
-    rollout, world = walker.rollout, walker.world
+    rollout, world = actor.rollout, actor.world
     qpos, up = rollout.qpos[:, world], np.array([0.0, 0.0, 1.0])
     trunk = qpos[:, :3].astype(float)
 
@@ -154,19 +158,19 @@ def _log_arrows(stream: rr.RecordingStream, robot: yourdfpy.URDF, root: str, wal
     arrows("velocity/actual", trunk + 0.27 * up, SPEED_SCALE * actual, ACTUAL)
 
 
-def _log_series(stream: rr.RecordingStream, root: str, walker: Walker, time: rr.TimeColumn, own: Color, several: bool) -> None:
+def _log_series(stream: rr.RecordingStream, root: str, actor: Actor, time: rr.TimeColumn, own: Color, several: bool) -> None:
     """Log the plots; curves that `several` robots share a plot with tell whose they are, by name and by its `own` colour."""
-    for name, plot in plots(walker.rollout, walker.world).items():
+    for name, plot in plots(actor.rollout, actor.world).items():
         for curve_name, curve in plot.curves.items():
             path, color = f"{root}/{name}/{curve_name}", own if curve.color == TOTAL else curve.color
-            shown = f"{walker.label}: {curve_name}" if several and name in SHARED and curve_name != "command" else curve_name
+            shown = f"{actor.label}: {curve_name}" if several and name in SHARED and curve_name != "command" else curve_name
             stream.log(path, rr.SeriesLines(colors=[color], names=[shown], widths=[curve.width]), static=True)
             stream.send_columns(path, indexes=[time], columns=rr.Scalars.columns(scalars=curve.values))
 
 
-def _layout(walkers: Sequence[Walker]) -> Blueprint:
-    titles = {name: plot.title for name, plot in plots(walkers[0].rollout, walkers[0].world).items()}
-    return walk_layout(names(walkers), titles)
+def _layout(actors: Sequence[Actor]) -> Blueprint:
+    titles = {name: plot.title for name, plot in plots(actors[0].rollout, actors[0].world).items()}
+    return walk_layout(names(actors), titles)
 
 
 def _port(url: str) -> int:

@@ -13,7 +13,7 @@ GROUND_FORCE, PUSH, COMMAND, ACTUAL = (60, 230, 130), (230, 40, 40), (110, 110, 
 
 
 @dataclass(frozen=True)
-class Walker:
+class Actor:
     """One world of a rollout, on a lane of its own."""
 
     label: str
@@ -22,7 +22,7 @@ class Walker:
     lane: float = 0.0  # how far it is moved along y [m]
 
 
-def line_up(rollouts: Sequence[tuple[str, Rollout]], worlds: int = 1) -> list[Walker]:
+def line_up(rollouts: Sequence[tuple[str, Rollout]], worlds: int = 1) -> list[Actor]:
     """Place the first `worlds` worlds of every labelled rollout side by side, from left to right, centred.
 
     Args:
@@ -31,7 +31,7 @@ def line_up(rollouts: Sequence[tuple[str, Rollout]], worlds: int = 1) -> list[Wa
     """
     places = [(label, rollout, i) for label, rollout in rollouts for i in range(min(worlds, rollout.qpos.shape[1]))]
     return [
-        Walker(
+        Actor(
             label=label if min(worlds, rollout.qpos.shape[1]) == 1 else f"{label} {world + 1}",
             rollout=rollout,
             world=world,

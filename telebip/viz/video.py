@@ -13,7 +13,7 @@ from telebip.errors import UserError
 from telebip.eval.walk import heading_velocity
 from telebip.robot import FEET, Robot
 from telebip.viz.render import Renderer
-from telebip.viz.scene import FORCE_SCALE, GROUND_FORCE, LANE, PUSH, PUSH_SCALE, Walker
+from telebip.viz.scene import FORCE_SCALE, GROUND_FORCE, LANE, PUSH, PUSH_SCALE, Actor
 from telebip.viz.series import running_cost_of_transport, running_mean
 
 SUFFIXES = (".mp4", ".gif")
@@ -22,7 +22,7 @@ Array = NDArray[np.floating]
 
 
 def film(
-    walkers: Sequence[Walker],
+    actors: Sequence[Actor],
     robot: Robot,
     file: Path,
     size: tuple[int, int] | None = None,
@@ -32,7 +32,7 @@ def film(
     """Film walks in real time.
 
     Args:
-        walkers: who walked, from `telebip.viz.scene.line_up`; all for the same time.
+        actors: who walked, from `telebip.viz.scene.line_up`; all for the same time.
         robot: their model.
         file: `.mp4` (H.264) or `.gif`; its folder is made.
         size: width and height [pixels], even numbers; 960 x 540, and half of it for a GIF, if not given.
@@ -43,10 +43,10 @@ def film(
         UserError: there is no OpenGL to render with, or the file cannot be written.
     """
     size = size or ((480, 270) if file.suffix == ".gif" else (960, 540))
-    rows = frame_rows(walkers[0].rollout.time, start)
+    rows = frame_rows(actors[0].rollout.time, start)
 
     def pictures() -> Iterator[Image.Image]:
-        for i, picture in enumerate(_pictures(walkers, robot, rows, size)):
+        for i, picture in enumerate(_pictures(actors, robot, rows, size)):
             yield picture
             progress(i + 1, len(rows))
 
@@ -64,71 +64,69 @@ def frame_rows(time: Array, start: float = 0.0) -> NDArray[np.integer]:
     return np.abs(time[None] - frames[:, None] / FPS).argmin(1) if len(frames) else np.array([len(time) - 1])
 
 
-def _pictures(
-    walkers: Sequence[Walker], robot: Robot, rows: NDArray[np.integer], size: tuple[int, int]
-) -> Iterator[Image.Image]:
-    path = camera_path(walkers)
-    speeds, costs = zip(*(_speed_and_cost(walker) for walker in walkers), strict=True)
+def _pictures(actors: Sequence[Actor], robot: Robot, rows: NDArray[np.integer], size: tuple[int, int]) -> Iterator[Image.Image]:
+    path = camera_path(actors)
+    speeds, costs = zip(*(_speed_and_cost(actor) for actor in actors), strict=True)
     font = ImageFont.load_default(size[1] / 22)
-    several = len(walkers) > 1
-    width = LANE * (len(walkers) - 1)
+    several = len(actors) > 1
+    width = LANE * (len(actors) - 1)
     with Renderer(robot, size, extent=1.7 + width) as renderer:
         for row in rows:
             renderer.look_at([*path[row], 0.42], 1.7 + 0.6 * width, azimuth=125.0, elevation=-12.0)
-            poses = [_in_lane(walker, row) for walker in walkers]
+            poses = [_in_lane(actor, row) for actor in actors]
             feet = renderer.place(poses)
-            for walker, qpos, soles in zip(walkers, poses, feet, strict=True):
-                _annotate(renderer, walker, row, qpos, soles, labelled=several)
+            for actor, qpos, soles in zip(actors, poses, feet, strict=True):
+                _annotate(renderer, actor, row, qpos, soles, labelled=several)
             picture = Image.fromarray(renderer.render())
             lines = [
-                f"{walker.label + ': ' if several else ''}{_numbers(speed[row], cost[row])}"
-                for walker, speed, cost in zip(walkers, speeds, costs, strict=True)
+                f"{actor.label + ': ' if several else ''}{_numbers(speed[row], cost[row])}"
+                for actor, speed, cost in zip(actors, speeds, costs, strict=True)
             ]
-            _write_lines(picture, [_headline(walkers[0], row), *lines], font)
+            _write_lines(picture, [_headline(actors[0], row), *lines], font)
             yield picture
 
 
-def camera_path(walkers: Sequence[Walker], seconds: float = 0.5) -> Array:
+def camera_path(actors: Sequence[Actor], seconds: float = 0.5) -> Array:
     """Return where the camera looks: the middle of the robots on the ground, without their sway [m], (steps, 2)."""
-    places = np.mean([walker.rollout.qpos[:, walker.world, :2] + [0.0, walker.lane] for walker in walkers], axis=0)
-    half = max(1, round(0.5 * seconds / walkers[0].rollout.step_dt))
+    places = np.mean([actor.rollout.qpos[:, actor.world, :2] + [0.0, actor.lane] for actor in actors], axis=0)
+    half = max(1, round(0.5 * seconds / actors[0].rollout.step_dt))
     sums = np.concatenate([np.zeros((1, 2)), np.cumsum(places, axis=0, dtype=float)])
     row = np.arange(len(places))
     reach = np.minimum(half, np.minimum(row, len(places) - 1 - row))  # a window that stays centred up to the ends
     return (sums[row + reach + 1] - sums[row - reach]) / (2 * reach + 1)[:, None]
 
 
-def _in_lane(walker: Walker, row: int) -> Array:
-    qpos = walker.rollout.qpos[row, walker.world].astype(float)
-    qpos[1] += walker.lane
+def _in_lane(actor: Actor, row: int) -> Array:
+    qpos = actor.rollout.qpos[row, actor.world].astype(float)
+    qpos[1] += actor.lane
     return qpos
 
 
-def _annotate(renderer: Renderer, walker: Walker, row: int, qpos: Array, feet: Array, labelled: bool) -> None:
+def _annotate(renderer: Renderer, actor: Actor, row: int, qpos: Array, feet: Array, labelled: bool) -> None:
     """Add ground forces at the feet (2, 3) [m], the push on the trunk, and the label."""
     for i in range(len(FEET)):
-        force = float(walker.rollout.foot_force[row, walker.world, i])
+        force = float(actor.rollout.foot_force[row, actor.world, i])
         renderer.arrow(feet[i], feet[i] + [0.0, 0.0, FORCE_SCALE * force], GROUND_FORCE, radius=0.022)
     trunk = qpos[:3] + [0.0, 0.0, 0.1]
-    renderer.arrow(trunk, trunk + PUSH_SCALE * walker.rollout.push_w[row, walker.world], PUSH, radius=0.02)
+    renderer.arrow(trunk, trunk + PUSH_SCALE * actor.rollout.push_w[row, actor.world], PUSH, radius=0.02)
     if labelled:
-        renderer.label(qpos[:3] + [0.0, 0.0, 0.32], walker.label)
+        renderer.label(qpos[:3] + [0.0, 0.0, 0.32], actor.label)
 
 
-def _speed_and_cost(walker: Walker) -> tuple[Array, Array]:
+def _speed_and_cost(actor: Actor) -> tuple[Array, Array]:
     """Return forward speed [m/s] and running cost of transport, (steps,) each, both over the last second."""
-    rollout, world = walker.rollout, walker.world
+    rollout, world = actor.rollout, actor.world
     window = round(1.0 / rollout.step_dt)
     velocity = heading_velocity(rollout.qpos[:, world], rollout.qvel[:, world])
     cost = running_cost_of_transport(rollout.joint_power[:, world].sum(-1), velocity, rollout.weight, window)
     return running_mean(velocity[:, 0], window), cost
 
 
-def _headline(walker: Walker, row: int) -> str:
-    vx, vy, turn = walker.rollout.command[row, walker.world]
+def _headline(actor: Actor, row: int) -> str:
+    vx, vy, turn = actor.rollout.command[row, actor.world]
     sideways = f", {vy:+.2f} m/s left" if abs(vy) > 0.005 else ""
     turning = f", {turn:+.2f} rad/s" if abs(turn) > 0.005 else ""
-    return f"command {vx:.2f} m/s{sideways}{turning}   {walker.rollout.time[row]:4.1f} s"
+    return f"command {vx:.2f} m/s{sideways}{turning}   {actor.rollout.time[row]:4.1f} s"
 
 
 def _numbers(speed: float, cost: float) -> str:
