@@ -70,6 +70,7 @@ class TelebipEnv(VecEnv):
         self.command = zeros(3)  # what the policy sees: the target command and the heading hold's correction
         self.target_command = zeros(3)
         self.reference_heading = zeros()  # [rad]
+        self.reward_terms = torch.zeros(len(REWARDS), self.num_envs, device=self.device)  # of the last step
         self.push_wrench_w = zeros(6)  # on the trunk's centre of mass, world frame [N, N m]
         self._push_timer = zeros()  # time until the next push starts [s]
         self._push_time_left = zeros()  # of the present push [s]
@@ -151,6 +152,7 @@ class TelebipEnv(VecEnv):
         )
         terms = torch.stack([term(context, cfg.reward) for term in REWARDS.values()])
         terms = torch.where(fault & ~torch.isfinite(terms), 0.0, terms)
+        self.reward_terms.copy_(terms)
         rewards = terms.sum(0)
         log = self._log(context, terms, fault)
         self.last_action.copy_(actions)

@@ -33,6 +33,7 @@ class Rollout:
     command: NDArray[np.float32]  # (steps, num_envs, 3): the target command, without the heading hold [m/s, m/s, rad/s]
     reference_heading: NDArray[np.float32]  # (steps, num_envs) [rad]
     reward: NDArray[np.float32]  # (steps, num_envs)
+    reward_terms: NDArray[np.float32]  # (steps, num_envs, terms), in the order of `REWARDS`; their sum is `reward`
     fallen: NDArray[np.bool_]  # (steps, num_envs): the episode ended here by a fall or a fault
 
     @property
@@ -84,6 +85,7 @@ def roll_out(env: TelebipEnv, policy: Policy, steps: int, progress: Callable[[in
                 "phase": env.phase,
                 "reference_heading": env.reference_heading,
                 "push_w": env.push_wrench_w[:, :3],
+                "reward_terms": env.reward_terms.T,
             }
             rows.append({name: value.clone() for name, value in row.items()})
             rows[-1] |= {"command": command, "reward": reward, "fallen": dones & ~extras["time_outs"]}

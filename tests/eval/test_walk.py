@@ -13,6 +13,7 @@ from telebip.control.policy import Stateless
 from telebip.env import TelebipEnv
 from telebip.eval.rollout import Rollout, roll_out
 from telebip.eval.walk import cost_of_transport, heading_velocity, summarise
+from telebip.mdp.rewards import REWARDS
 
 STEP_DT, WEIGHT = 0.02, 130.0  # s, N
 
@@ -34,6 +35,7 @@ def walk(steps: int = 200, worlds: int = 2, **replaced: Any) -> Rollout:
         "command": 3,
         "reference_heading": 0,
         "reward": 0,
+        "reward_terms": len(REWARDS),
         "fallen": 0,
     }
     arrays = {}
@@ -136,10 +138,12 @@ def test_a_rollout_of_real_worlds(make_env: Callable[..., TelebipEnv]) -> None:
         "command": (3,),
         "reference_heading": (),
         "reward": (),
+        "reward_terms": (len(REWARDS),),
         "fallen": (),
     }
     for name, shape in shapes.items():
         assert getattr(rollout, name).shape == (15, 4, *shape), name
+    np.testing.assert_allclose(rollout.reward_terms.sum(-1), rollout.reward, atol=1e-6)
     assert not rollout.fallen.any()  # time-outs are no falls
     np.testing.assert_array_equal(rollout.qpos[-1], env.sim.state.qpos.numpy())
     assert np.ptp(rollout.qpos[:, :, 9], axis=0).min() > 0.0  # rows are copies, not one live buffer
