@@ -143,10 +143,11 @@ class Walker:
         velocity = self._velocity + (body.command - self._velocity).clamp(-most, most)
         self._velocity.copy_(torch.where(new[:, None], body.com_vel[:, :2], velocity))
 
-        # The integral of the speed error, once per step.
+        # The integral of the speed error, once per step, but not while the robot is still gathering speed.
         error = self._velocity - self._path / self._elapsed.clamp(min=self.step_dt)[:, None]
         speed = (self._speed + cfg.speed_gain * error).clamp(-cfg.speed_limit, cfg.speed_limit)
-        self._speed.copy_(torch.where(over[:, None], speed, self._speed).masked_fill(new[:, None], 0.0))
+        counts = over[:, None] & (self._velocity == body.command)
+        self._speed.copy_(torch.where(counts, speed, self._speed).masked_fill(new[:, None], 0.0))
 
         begin = (over | new)[:, None]
         stance_foot, swing_foot = self._stance_and_swing(body.foot)

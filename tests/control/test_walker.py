@@ -1,0 +1,173 @@
+"""The two walkers on the robot: they walk, remember nothing that they should forget, and cannot tell left from right."""
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+from worlds import HostReads, MakeEnv, observe, random_actions
+
+from telebip.control.config import load_controller, split_overrides
+from telebip.control.factory import PLACEMENTS, make_controller
+from telebip.control.walker import Walker
+from telebip.env import TelebipEnv
+from telebip.errors import UserError
+from telebip.eval.rollout import Rollout, roll_out
+from telebip.eval.walk import summarise
+
+NAMES = pytest.mark.parametrize("name", PLACEMENTS)
+
+
+def walk(env: TelebipEnv, name: str, command: tuple[float, float, float], seconds: float) -> Rollout:
+    env.set_command(*command)
+    return roll_out(env, make_controller(name, env), round(seconds / env.step_dt))
+
+
+@NAMES
+@pytest.mark.parametrize("speed", [0.5, 0.7, 1.0, 0.0, -0.3])
+def test_it_walks(make_env: MakeEnv, name: str, speed: float) -> None:
+    summary = summarise(walk(make_env(calm=True), name, (speed, 0.0, 0.0), 5.0), skip=2.0)
+    assert summary.falls == 0
+    assert summary.speed == pytest.approx((speed, 0.0), abs=0.06)
+    assert summary.yaw_drift_deg < 15.0
+    assert summary.gait_period == pytest.approx(2.0 * load_controller(name).step_time, abs=0.02)
+
+
+@NAMES
+def test_it_walks_at_the_rate_of_the_physics(make_env: MakeEnv, name: str) -> None:
+    env = make_env("sim.decimation=1", calm=True)
+    assert env.step_dt == pytest.approx(0.005)
+    summary = summarise(walk(env, name, (0.7, 0.0, 0.0), 5.0), skip=2.0)
+    assert summary.falls == 0
+    assert summary.speed == pytest.approx((0.7, 0.0), abs=0.06)
+
+
+@NAMES
+def test_it_walks_sideways_and_turns(make_env: MakeEnv, name: str) -> None:
+    sideways = summarise(walk(make_env(calm=True), name, (0.3, 0.1, 0.0), 6.0), skip=3.0)
+    assert sideways.falls == 0
+    assert sideways.speed == pytest.approx((0.3, 0.1), abs=0.05)
+    turning = walk(make_env(calm=True), name, (0.5, 0.0, 0.1), 8.0)
+    assert not turning.fallen.any()
+    heading = turning.reference_heading[-1] - turning.reference_heading[0]
+    np.testing.assert_allclose(np.unwrap(turning.reference_heading, axis=0)[-1] - turning.reference_heading[0], 0.8, atol=0.01)
+    assert heading.shape == (4,)
+    assert summarise(turning, skip=3.0).yaw_drift_deg < 20.0
+
+
+@NAMES
+def test_it_withstands_the_tasks_pushes_friction_and_noise(make_env: MakeEnv, name: str) -> None:
+    env = make_env("episode.length=20", num_envs=8)
+    assert walk(env, name, (0.7, 0.0, 0.0), 6.0).fallen.sum() <= 1
+
+
+def mirror(obs: Tensor) -> Tensor:
+    """Reflect observations in the plane y = 0: legs change sides; y, roll and yaw change sign."""
+    leg = torch.tensor([-1.0, 1.0, 1.0]).repeat(2)
+    joints = [part.unflatten(1, (2, 3)).flip(1).flatten(1) * leg for part in obs[:, :18].split(6, dim=1)]
+    signs = torch.tensor([1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, -1.0])
+    return torch.cat([*joints, obs[:, 18:31] * signs, obs[:, 31:].flip(1)], dim=1)
+
+
+def policy_obs(obs: Tensor) -> TensorDict:
+    return TensorDict({"policy": obs}, batch_size=[len(obs)])
+
+
+def seen(env: TelebipEnv, name: str, steps: int) -> list[Tensor]:
+    """Return what a walker observes while it walks and is disturbed a little."""
+    env.set_command(0.6, 0.1, 0.05)
+    policy, observations = make_controller(name, env), []
+    for noise in random_actions(steps, env.num_envs, 0.1):
+        observations.append(observe(env))
+        env.step(policy(policy_obs(observations[-1])) + noise)
+    return observations
+
+
+@NAMES
+def test_a_mirrored_robot_acts_mirrored(make_env: MakeEnv, name: str) -> None:
+    env = make_env(calm=True)
+    observations = seen(env, name, 40)
+    policy, image = make_controller(name, env), make_controller(name, env)
+    leg = torch.tensor([-1.0, 1.0, 1.0]).repeat(2)
+    for obs in observations:
+        actions, mirrored = policy(policy_obs(obs)), image(policy_obs(mirror(obs)))
+        expected = actions.unflatten(1, (2, 3)).flip(1).flatten(1) * leg
+        torch.testing.assert_close(mirrored, expected, atol=1e-4, rtol=1e-4)
+    assert actions.abs().max() > 0.1
+
+
+@NAMES
+def test_a_reset_world_is_as_new_and_the_others_go_on_bit_for_bit(make_env: MakeEnv, name: str) -> None:
+    env = make_env(calm=True)
+    observations = seen(env, name, 40)
+    untouched, reset, new = (make_controller(name, env) for _ in range(3))
+    mask = torch.tensor([False, True, False, True])
+    for step, obs in enumerate(observations):
+        if step == 25:
+            reset.reset(mask)
+        a, b = untouched(policy_obs(obs)), reset(policy_obs(obs))
+        assert torch.equal(a[~mask], b[~mask])
+        if step >= 25:
+            assert torch.equal(b[mask], new(policy_obs(obs))[mask])
+            assert step > 25 or not torch.equal(a[mask], b[mask])
+
+
+@NAMES
+def test_worlds_do_not_know_of_each_other(make_env: MakeEnv, name: str) -> None:
+    env = make_env(calm=True)
+    observations = seen(env, name, 20)
+    order = torch.tensor([2, 0, 3, 1])
+    policy, shuffled = make_controller(name, env), make_controller(name, env)
+    for obs in observations:
+        assert torch.equal(policy(policy_obs(obs))[order], shuffled(policy_obs(obs[order])))
+
+
+@NAMES
+def test_a_call_reads_nothing_back_to_the_host(make_env: MakeEnv, name: str) -> None:
+    env = make_env(calm=True)
+    policy, obs = make_controller(name, env), env.get_observations()
+    with HostReads() as reads:
+        for step in range(30):
+            policy(obs)
+            if step % 10 == 5:
+                policy.reset(torch.tensor([True, False, False, True]))
+    assert reads.seen == []
+
+
+@NAMES
+def test_any_state_gets_a_finite_answer(make_env: MakeEnv, name: str) -> None:
+    env = make_env(num_envs=64)
+    policy = make_controller(name, env)
+    generator = torch.Generator().manual_seed(0)
+    low, high = torch.as_tensor(env.robot.joint_range).float().T
+    for _ in range(30):  # lying on its back, upside down, at any speed
+        obs = 3.0 * torch.randn(64, 33, generator=generator)
+        obs[:, 24:28] /= obs[:, 24:28].norm(dim=1, keepdim=True)
+        actions = policy(policy_obs(obs))
+        assert actions.isfinite().all()
+        target = env._nominal + env._action_scale * actions
+        assert ((target >= low - 1e-5) & (target <= high + 1e-5)).all()
+
+
+def error_of(env: TelebipEnv, name: str, *overrides: str) -> str:
+    with pytest.raises(UserError) as caught:
+        make_controller(name, env, overrides)
+    return str(caught.value)
+
+
+def test_mistakes_are_one_line_that_names_them(make_env: MakeEnv) -> None:
+    env = make_env()
+    assert error_of(env, "alp") == "unknown controller 'alp'; did you mean 'alip'?"
+    message = error_of(env, "dcm", "control.swing_hight=0.1")
+    assert "unknown field 'control.swing_hight'; did you mean 'control.swing_height'?" in message
+    assert "control.step_time must be > 0 s, got 0.0" in error_of(env, "dcm", "control.step_time=0")
+    assert "control.feet_distance must be [low, high]" in error_of(env, "dcm", "control.feet_distance=[1, 0.1]")
+
+
+def test_overrides_reach_the_controller(make_env: MakeEnv) -> None:
+    policy: Walker = make_controller("alip", make_env(), ["control.swing_height=0.1"])
+    assert (policy.cfg.swing_height, load_controller("alip").swing_height) != (0.1, 0.1)
+    assert split_overrides(["seed=2", "control.step_time=0.3", "gait.period=0.6"]) == (
+        ["seed=2", "gait.period=0.6"],
+        ["control.step_time=0.3"],
+    )
