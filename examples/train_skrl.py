@@ -108,9 +108,7 @@ def main() -> None:
     options = parser.parse_args()
     statistics = train(options.num_envs, options.iterations)
     lengths, mean_return = statistics.length_queue, np.mean(statistics.return_queue)
-    print(
-        f"the last {len(lengths)} of {statistics.episode_count} episodes: {np.mean(lengths):.0f} steps, return {mean_return:.1f}"
-    )
+    print(f"last {len(lengths)} of {statistics.episode_count} episodes: {np.mean(lengths):.0f} steps, return {mean_return:.2f}")
 
 
 if __name__ == "__main__":
