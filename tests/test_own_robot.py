@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from telebip import ROOT
-from telebip.cli import export, play, train
+from telebip.cli import evaluate, export, play, train
 from telebip.config import load_task
 from telebip.env import TelebipEnv
 from telebip.rl.checkpoint import load_checkpoint
@@ -55,6 +55,27 @@ def test_it_is_played_and_measured_from_its_checkpoint_alone(run_dir: Path, caps
     text = capsys.readouterr().out
     assert "rotary_knee, 2 worlds x 1 s" in text
     assert re.search(r"cost of transport \d+\.\d+ mechanical", text)
+
+
+def test_it_is_evaluated(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = run_dir / "report"
+    measure = [
+        "--suite",
+        "tracking",
+        "--commands",
+        "0.7",
+        "--num-envs",
+        "2",
+        "--duration",
+        "2",
+        "--device",
+        "cpu",
+        "--out",
+        str(out),
+    ]
+    evaluate.main(["--checkpoint", str(run_dir), *measure])
+    assert "rotary_knee" in capsys.readouterr().out
+    assert json.loads((out / "results.json").read_text())["label"] == "rotary_knee"
 
 
 def test_its_export_says_newton_metres(run_dir: Path) -> None:

@@ -5,12 +5,14 @@ from collections.abc import Sequence
 from types import ModuleType
 
 from telebip import __version__
-from telebip.cli import common, export, play, train
+from telebip.cli import common, evaluate, export, play, reproduce, train
 from telebip.errors import UserError, nearest
 
 COMMANDS: dict[str, ModuleType] = {
     "train": train,
     "play": play,
+    "evaluate": evaluate,
+    "reproduce": reproduce,
     "export": export,
 }
 """Name -> module with `main(argv)`; the first line of its docstring is the command's description."""
