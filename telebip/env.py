@@ -33,6 +33,7 @@ class TelebipEnv(VecEnv):
         robot: Robot,
         device: str | torch.device = "cpu",
         backend: Backend = "auto",
+        keep_final_obs: bool = False,
     ) -> None:
         """Create and reset the worlds.
 
@@ -41,11 +42,13 @@ class TelebipEnv(VecEnv):
             robot: from `telebip.robot.load_robot(cfg.sim.robot)`.
             device: where tensors live.
             backend: physics engine, see `telebip.sim.make_simulator`.
+            keep_final_obs: whether `step` also returns what ending episodes saw last, before their worlds were reset.
         """
         self.cfg: TaskConfig = cfg
         self.robot = robot
         self.device: torch.device = torch.device(device)
         self.num_envs, self.num_actions = cfg.num_envs, 6
+        self._keep_final_obs = keep_final_obs
         self.sim = make_simulator(backend, robot, self.num_envs, cfg.sim.decimation, self.device, ("geom_friction",))
         self.step_dt = cfg.sim.decimation * robot.physics_dt  # [s]
         self.max_episode_length: int = max(1, round(cfg.episode.length / self.step_dt))  # policy steps
@@ -110,6 +113,7 @@ class TelebipEnv(VecEnv):
         Returns:
             Observations {"policy": (num_envs, 33)}, rewards (num_envs,), dones (num_envs,) bool, and extras: `time_outs`
             (num_envs,) bool, and `log`, a dictionary of scalars on the device: each reward term's mean, errors and faults.
+            With `keep_final_obs` also `final_obs`, observations from before any reset.
 
         Raises:
             ValueError: `actions` has another shape.
@@ -158,10 +162,14 @@ class TelebipEnv(VecEnv):
         self.last_action.copy_(actions)
 
         # 5. Reset finished worlds, draw new commands where they are due, observe.
+        extras = {"time_outs": time_outs, "log": log}
+        if self._keep_final_obs:
+            self._hold_heading()
+            extras["final_obs"] = self.get_observations()
         self._reset(dones)
         self._base_lin_vel_b.copy_(rotate_inverse(state.base_quat, state.base_lin_vel_w))
         self._update_commands()
-        return self.get_observations(), rewards, dones, {"time_outs": time_outs, "log": log}
+        return self.get_observations(), rewards, dones, extras
 
     def get_observations(self) -> TensorDict:
         """Return a new {"policy": (num_envs, 33)}, with fresh noise where it is enabled; see `mdp.observations.LAYOUT`."""
@@ -214,8 +222,12 @@ class TelebipEnv(VecEnv):
             due = self._command_timer < 0.5 * self.step_dt
             self.target_command.copy_(torch.where(due[:, None], new, self.target_command))
             self._command_timer.copy_(torch.where(due, cfg.resampling_time, self._command_timer))
+        self._hold_heading()
+
+    def _hold_heading(self) -> None:
+        """Turn the target command's yaw rate towards the reference heading."""
         heading = yaw(self.sim.state.base_quat)
-        gain, limit = cfg.heading_gain, cfg.heading_limit
+        gain, limit = self.cfg.command.heading_gain, self.cfg.command.heading_limit
         self.command.copy_(hold_heading(self.target_command, heading, self.reference_heading, gain, limit))
 
     def _log(self, context: StepContext, terms: Tensor, fault: Tensor) -> dict[str, Tensor]:

@@ -15,7 +15,7 @@ LAYERS = [
     {"telebip.sim"},
     {"telebip.mdp"},
     {"telebip.env"},
-    {"telebip.rl", "telebip.control", "telebip.eval", "telebip.viz"},
+    {"telebip.rl", "telebip.control", "telebip.eval", "telebip.viz", "telebip.gym"},
     {"telebip.cli"},
     {"scripts"},
 ]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from telebip.cli.common import Parser, resolve_device
+from telebip.cli.common import Parser, invocation, resolve_device
 from telebip.config import TaskConfig, load_task, task_names
 from telebip.errors import UserError
 
@@ -84,8 +84,10 @@ def _train(options: argparse.Namespace, task: str, config: TaskConfig, run_dir: 
         trainer.learn(stop, show)
     finished = trainer.iteration >= total
     if not finished:
-        console.print(f"stopped after iteration {trainer.iteration} of {total}; go on with: train.py --resume {run_dir}")
-    console.print(f"see it walk: python scripts/play.py --checkpoint {run_dir}")
+        console.print(
+            f"stopped after iteration {trainer.iteration} of {total}; go on with: {invocation('train')} --resume {run_dir}"
+        )
+    console.print(f"see it walk: {invocation('play')} --checkpoint {run_dir}")
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
