@@ -57,11 +57,11 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def controller_subject(name: str, label: str | None, overrides: Sequence[str] = ()):
     """Return a model-based walker as a subject of the evaluator, with `overrides` of its parameters and of the task."""
+    from telebip.control.config import split_overrides
     from telebip.control.factory import make_controller
     from telebip.eval.suites import Subject
 
-    own = [override for override in overrides if override.startswith("control.")]
-    task = [override for override in overrides if not override.startswith("control.")]
+    task, own = split_overrides(overrides)
     return Subject(
         label=label or name,
         config=load_task("telebip_flat", task),
@@ -156,7 +156,9 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("overrides", nargs="*", metavar="key.path=value", help="override any field of the task")
     options = parser.parse(argv)
     if not (options.checkpoint or options.controller):
-        raise UserError("what is to be measured? --checkpoint PATH_OR_RUN (try assets/policies/telebip_flat), or --controller")
+        raise UserError(
+            "what is to be measured? --checkpoint PATH_OR_RUN (try assets/policies/telebip_efficient), or --controller"
+        )
     for name, low, high in (
         ("num_envs", 1, 2**20),
         ("duration", 1.0, 3600.0),

@@ -23,7 +23,7 @@ EXAMPLES = """\
 def main(argv: Sequence[str] | None = None) -> None:
     """Parse arguments and draw."""
     parser = Parser("Make the pictures of README and docs anew, from the shipped policy.", EXAMPLES)
-    parser.add_argument("--checkpoint", metavar="PATH_OR_RUN", default=str(ROOT / "assets" / "policies" / "telebip_flat"))
+    parser.add_argument("--checkpoint", metavar="PATH_OR_RUN", default=str(ROOT / "assets" / "policies" / "telebip_efficient"))
     parser.add_argument("--command", nargs=3, type=float, metavar=("VX", "VY", "WZ"), default=(0.7, 0.0, 0.0))
     parser.add_argument("--out", metavar="DIR", type=Path, default=ROOT / "docs" / "images", help="default: docs/images")
     parser.add_argument("--only", nargs="+", metavar="PICTURE", help=f"of {', '.join(PICTURES)} (default: all)")
@@ -46,7 +46,8 @@ class Gallery:
     def __init__(self, checkpoint: str, command: tuple[float, float, float]) -> None:
         """Walk the policy for ten seconds from rest."""
         from telebip.env import TelebipEnv
-        from telebip.eval.rollout import as_evaluated, roll_out
+        from telebip.eval.conditions import as_evaluated
+        from telebip.eval.rollout import roll_out
         from telebip.rl.checkpoint import load_checkpoint
         from telebip.rl.policy import load_policy
         from telebip.robot import load_robot

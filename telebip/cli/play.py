@@ -8,18 +8,19 @@ from telebip.cli.common import Parser, resolve_device
 from telebip.config import TaskConfig, load_task
 from telebip.control.config import split_overrides
 from telebip.errors import UserError
+from telebip.eval.conditions import as_evaluated
 from telebip.viz.opengl import choose_opengl
 
 CONTROLLERS, AGENTS = ("alip", "dcm"), ("zero", "random")
 SUFFIXES = (".rrd", ".mp4", ".gif", ".png")
 EXAMPLES = """\
-  play.py --checkpoint assets/policies/telebip_flat --viewer rerun
-  play.py --checkpoint assets/policies/telebip_flat --record walk.rrd      (then: rerun walk.rrd)
+  play.py --checkpoint assets/policies/telebip_efficient --viewer rerun
+  play.py --checkpoint assets/policies/telebip_efficient --record walk.rrd      (then: rerun walk.rrd)
   play.py --checkpoint runs/telebip_flat/2026-01-31_12-00-00 --command 0.7 0 0
-  play.py --checkpoint assets/policies/telebip_flat --viewer mujoco                (steer it: arrow keys, Enter pushes)
-  play.py --checkpoint assets/policies/telebip_flat --num-envs 64 --duration 20
+  play.py --checkpoint assets/policies/telebip_efficient --viewer mujoco                (steer it: arrow keys, Enter pushes)
+  play.py --checkpoint assets/policies/telebip_efficient --num-envs 64 --duration 20
   play.py --controller alip --command 0.7 0 0 control.swing_height=0.05    (a model-based walker)
-  play.py --checkpoint assets/policies/telebip_flat --beside alip dcm --record both.mp4
+  play.py --checkpoint assets/policies/telebip_efficient --beside alip dcm --record both.mp4
   play.py --agent zero --task telebip_flat --duration 3                    (what the robot does without a policy)
 """
 
@@ -37,7 +38,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     else:
         task, config = Path(options.task).stem, load_task(options.task)
     command = _command(options.command, config)
-    _play(options, task, _as_played(config, options), command, checkpoint)
+    overrides = [*([] if options.seed is None else [f"seed={options.seed}"]), *options.overrides]
+    config = as_evaluated(config, options.num_envs, options.duration, overrides, disturbed=options.disturb)
+    _play(options, task, config, command, checkpoint)
 
 
 def _play(options: argparse.Namespace, task: str, config: TaskConfig, command, checkpoint) -> None:
@@ -154,19 +157,6 @@ def _command(given: Sequence[float] | None, config: TaskConfig) -> tuple[float, 
     return tuple(0.5 * (low + high) for low, high in ranges)  # type: ignore[return-value]
 
 
-def _as_played(config: TaskConfig, options: argparse.Namespace) -> TaskConfig:
-    """Return the task without disturbances, and without a time-out before the duration is over."""
-    overrides = [
-        f"num_envs={options.num_envs}",
-        f"episode.length={options.duration + 1.0}",
-        "episode.reset_heading=0",
-        *(f"disturbance.{name}.enabled={str(options.disturb).lower()}" for name in ("push", "friction", "noise")),
-        *([] if options.seed is None else [f"seed={options.seed}"]),
-        *options.overrides,
-    ]
-    return load_task(config, overrides)
-
-
 def _warn_untrained(console, command: tuple[float, float, float], checkpoint) -> None:
     """Say so if the policy never saw such a command in training."""
     if checkpoint is None:
@@ -223,7 +213,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     options = parser.parse(argv)
     if not (options.checkpoint or options.controller or options.agent):
         raise UserError(
-            "what should walk? --checkpoint PATH_OR_RUN (try assets/policies/telebip_flat), --controller alip|dcm, "
+            "what should walk? --checkpoint PATH_OR_RUN (try assets/policies/telebip_efficient), --controller alip|dcm, "
             "or --agent zero|random"
         )
     options.control_overrides = []

@@ -1,7 +1,7 @@
 """Walk a policy and keep what happened, as plain arrays for measuring, plotting and recording."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +9,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from telebip.config import TaskConfig, load_task
 from telebip.control.policy import Policy
 from telebip.env import TelebipEnv
 from telebip.sim import SimState
@@ -53,13 +52,6 @@ class Rollout:
     def _map(self, part: Callable[[np.ndarray], np.ndarray]) -> "Rollout":
         arrays = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in ("step_dt", "weight")}
         return dataclasses.replace(self, **{name: part(array) for name, array in arrays.items()})
-
-
-def as_evaluated(config: TaskConfig, num_envs: int, duration: float, overrides: Sequence[str] = ()) -> TaskConfig:
-    """Return a task for measuring `duration` s: no pushes, nominal friction, no noise, starts that face x, no time-outs."""
-    calm = [f"disturbance.{name}.enabled=false" for name in ("push", "friction", "noise")]
-    start = [f"num_envs={num_envs}", f"episode.length={duration + 1.0}", "episode.reset_heading=0"]
-    return load_task(config, [*start, *calm, *overrides])
 
 
 def roll_out(env: TelebipEnv, policy: Policy, steps: int, progress: Callable[[int], None] = lambda step: None) -> Rollout:

@@ -19,10 +19,11 @@ from telebip.config import TaskConfig
 from telebip.control.policy import Policy
 from telebip.env import TelebipEnv
 from telebip.errors import UserError, nearest
+from telebip.eval.conditions import as_evaluated
 from telebip.eval.gait import summarise_gait
 from telebip.eval.learning import learning_curve
 from telebip.eval.push import PushProtocol, push_limits, push_trial
-from telebip.eval.rollout import Rollout, as_evaluated, roll_out
+from telebip.eval.rollout import Rollout, roll_out
 from telebip.eval.walk import heading_velocity, summarise
 from telebip.robot import JOINTS, Robot
 from telebip.sim import Backend

@@ -1,0 +1,17 @@
+"""Under which conditions a policy is measured and shown."""
+
+from collections.abc import Sequence
+
+from telebip.config import TaskConfig, load_task
+
+
+def as_evaluated(
+    config: TaskConfig, num_envs: int | str, duration: float, overrides: Sequence[str] = (), disturbed: bool = False
+) -> TaskConfig:
+    """Return a task whose robots start facing x and walk `duration` s without a time-out.
+
+    Unless `disturbed`, there are no pushes and no observation noise, and the ground has the friction of the MJCF.
+    """
+    switches = [f"disturbance.{name}.enabled={str(disturbed).lower()}" for name in ("push", "friction", "noise")]
+    start = [f"num_envs={num_envs}", f"episode.length={duration + 1.0}", "episode.reset_heading=0"]
+    return load_task(config, [*start, *switches, *overrides])
