@@ -68,7 +68,7 @@ def test_imports_point_one_way(file: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("engine", "owners"), [("mujoco_warp", {"warp"}), ("warp", {"warp"}), ("rerun", {"rerun", "blueprint"})]
+    ("engine", "owners"), [("mujoco_warp", {"warp"}), ("warp", {"warp"}), ("rerun", {"rerun", "blueprint", "live"})]
 )
 def test_an_engine_has_one_owner(engine: str, owners: set[str]) -> None:
     users = {file.stem for file in FILES if any(module.split(".")[0] == engine for module in imports(file))}

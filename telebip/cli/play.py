@@ -54,6 +54,10 @@ def _play(options: argparse.Namespace, task: str, config: TaskConfig, command, c
         from telebip.eval.walk import summarise
         from telebip.robot import load_robot
 
+    if options.viewer == "rerun":
+        from telebip.viz.rerun import require_viewer
+
+        require_viewer(options.connect)
     device = resolve_device(options.device)
     robot = load_robot(config.sim.robot)
 

@@ -3,7 +3,7 @@
 import argparse
 import signal
 from collections.abc import Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from telebip.cli.common import Parser, invocation, resolve_device
@@ -14,6 +14,7 @@ EXAMPLES = """\
   train.py --task telebip_flat
   train.py --task telebip_fast --num-envs 2048 --max-iterations 500 ppo.num_steps_per_env=24
   train.py --resume runs/telebip_flat/2026-01-31_12-00-00 --max-iterations 400
+  train.py --task telebip_flat --viewer rerun               (curves and robots, live)
   tensorboard --logdir runs
 """
 
@@ -59,6 +60,10 @@ def _train(options: argparse.Namespace, task: str, config: TaskConfig, run_dir: 
         from telebip.rl.train import Trainer
         from telebip.robot import load_robot
 
+    if options.viewer == "rerun":
+        from telebip.viz.rerun import require_viewer
+
+        require_viewer(options.connect)
     device = resolve_device(options.device)
     if device.type == "cpu":
         prepare_cpu()
@@ -80,8 +85,19 @@ def _train(options: argparse.Namespace, task: str, config: TaskConfig, run_dir: 
     if trainer.iteration:
         console.print(f"resuming after iteration {trainer.iteration} of {total}")
 
-    with stop_on_signal(console) as stop, progress_bar(console, trainer) as show:
-        trainer.learn(stop, show)
+    with ExitStack() as stack:
+        stop = stack.enter_context(stop_on_signal(console))
+        show = watch = stack.enter_context(progress_bar(console, trainer))
+        if options.viewer == "rerun":
+            from telebip.viz.live import live_view
+
+            live = stack.enter_context(live_view(trainer, options.connect))
+
+            def watch(scalars: dict[str, float]) -> None:
+                show(scalars)
+                live(scalars)
+
+        trainer.learn(stop, watch)
     finished = trainer.iteration >= total
     if not finished:
         console.print(
@@ -109,6 +125,8 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         metavar="RUN_OR_CHECKPOINT",
         help="go on with a run, in its folder and with its configuration, up to --max-iterations in all",
     )
+    parser.add_argument("--viewer", choices=("none", "rerun"), default="none", help="watch the training (default: none)")
+    parser.add_argument("--connect", metavar="HOST:PORT", help="a running rerun viewer (default: start one here)")
     parser.add_argument("overrides", nargs="*", metavar="key.path=value", help="override any field of the task")
     return parser.parse(argv)
 

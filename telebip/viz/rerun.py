@@ -58,23 +58,43 @@ def show(actors: Sequence[Actor], urdf: Path, address: str | None = None) -> Non
 @contextmanager
 def viewer(layout: Blueprint, address: str | None) -> Iterator[rr.RecordingStream]:
     """Yield a stream into a rerun viewer, and wait at the end until everything has arrived; see `show`."""
+    require_viewer(address)
     stream = rr.RecordingStream("telebip")
     if address:
-        url = address if "://" in address else f"rerun+http://{address}/proxy"
-        host, port = urlsplit(url).hostname, _port(url)
-        try:
-            socket.create_connection((host or "", port), timeout=3.0).close()  # rerun itself would retry for ever
-        except OSError as error:
-            raise UserError(f"no rerun viewer answers at '{address}': {error.strerror or error}") from error
-        stream.connect_grpc(url, default_blueprint=layout)
-    elif has_display():
-        stream.spawn(default_blueprint=layout)
+        stream.connect_grpc(_url(address), default_blueprint=layout)
     else:
-        raise UserError("a rerun viewer needs a display; use --record FILE.rrd, or --connect HOST:PORT to a viewer elsewhere")
+        stream.spawn(default_blueprint=layout)
     try:
         yield stream
     finally:
         stream.disconnect()
+
+
+def require_viewer(address: str | None) -> None:
+    """Make sure that `show` and `viewer` have somewhere to send to.
+
+    Raises:
+        UserError: no viewer answers at `address`, or without one, there is no display to start a viewer on.
+    """
+    if not address:
+        if not has_display():
+            raise UserError(
+                "a rerun viewer needs a display; use --connect HOST:PORT with a viewer elsewhere, or play.py --record FILE.rrd"
+            )
+        return
+    try:
+        place = urlsplit(_url(address))
+        host, port = place.hostname or "", place.port or 9876
+    except ValueError as error:
+        raise UserError(f"'{address}' is no address of a rerun viewer: {error}") from error
+    try:
+        socket.create_connection((host, port), timeout=3.0).close()  # rerun itself would retry for ever
+    except OSError as error:
+        raise UserError(f"no rerun viewer answers at '{address}': {error.strerror or error}") from error
+
+
+def _url(address: str) -> str:
+    return address if "://" in address else f"rerun+http://{address}/proxy"
 
 
 def log_walks(stream: rr.RecordingStream, actors: Sequence[Actor], robot: yourdfpy.URDF) -> None:
@@ -171,10 +191,3 @@ def _log_series(stream: rr.RecordingStream, root: str, actor: Actor, time: rr.Ti
 def _layout(actors: Sequence[Actor]) -> Blueprint:
     titles = {name: plot.title for name, plot in plots(actors[0].rollout, actors[0].world).items()}
     return walk_layout(names(actors), titles)
-
-
-def _port(url: str) -> int:
-    try:
-        return urlsplit(url).port or 9876
-    except ValueError as error:
-        raise UserError(f"'{url}' is no address of a rerun viewer: {error}") from error

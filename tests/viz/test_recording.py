@@ -135,5 +135,5 @@ def test_a_viewer_that_is_not_there_is_one_line(walking: Rollout, urdf: Path, mo
     for variable in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(variable, raising=False)
     monkeypatch.setattr("sys.platform", "linux")
-    with pytest.raises(UserError, match="needs a display; use --record"):
+    with pytest.raises(UserError, match="needs a display; use --connect HOST:PORT"):
         show(line_up([("RL", walking)]), urdf)

@@ -1,0 +1,122 @@
+"""A training, watched while it runs: its learning curves, and a few robots under the policy of the moment."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+import torch
+
+from telebip.config import load_task
+from telebip.env import TelebipEnv
+from telebip.eval.rollout import roll_out
+from telebip.rl.checkpoint import Checkpoint
+from telebip.rl.policy import load_policy
+from telebip.rl.train import Trainer
+from telebip.viz.blueprint import training_layout
+from telebip.viz.rerun import log_mesh, viewer
+from telebip.viz.scene import LANE
+from telebip.viz.urdf import Array, link_poses, load_urdf
+
+WORLDS, SECONDS, FPS = 4, 4.0, 25
+BUDGET = 0.03  # share of the training's time that walks may take
+
+CHARTS = {
+    "episode length [policy steps]": ("train/episode_length",),
+    "return": ("train/episode_return",),
+    "velocity and yaw-rate error [m/s, rad/s]": ("error/lin_vel_mps", "error/yaw_rate_radps"),
+    "cost of transport": ("walk/cost_of_transport",),
+    "rewards per step": (),  # all of them
+    "samples per second": ("speed/samples_per_s",),
+}
+
+
+@contextmanager
+def live_view(trainer: Trainer, address: str | None) -> Iterator[Callable[[dict[str, float]], None]]:
+    """Open a rerun viewer (see `telebip.viz.rerun.viewer`) and yield the function that an iteration's scalars go to."""
+    with viewer(training_layout({title: _entities(names) for title, names in CHARTS.items()}), address) as stream:
+        view = LiveView(trainer, stream)
+        try:
+            yield view.update
+        finally:
+            view.close()
+
+
+class LiveView:
+    """Streams curves after every iteration, and now and then a new walk, which a thread of its own plays over and over.
+
+    The robots live in worlds of their own, with the task's commands and disturbances: the training does not notice them. They
+    walk on the CPU, anew whenever all walks so far have taken less than their share of the time.
+    """
+
+    def __init__(self, trainer: Trainer, stream: rr.RecordingStream, budget: float = BUDGET) -> None:
+        """Log the robots' shapes and start the thread; `budget` is the share of the time that walks may take."""
+        self._trainer, self._stream, self._budget = trainer, stream, budget
+        self._start, self._spent = time.perf_counter(), 0.0
+        own = [f"num_envs={WORLDS}", f"episode.length={SECONDS + 1.0}", "episode.reset_heading=0"]
+        self._env = TelebipEnv(load_task(trainer.env.cfg, own), trainer.env.robot, "cpu", "native")
+        self._urdf = load_urdf(trainer.env.robot.path.with_suffix(".urdf"))
+        stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        for link in self._urdf.link_map:
+            log_mesh(stream, f"world/{link}", self._urdf, link)
+        self._frames: list[dict[str, Array]] = []  # pose of each link in every world (WORLDS, 4, 4), for each frame
+        self._closing = threading.Event()
+        self._player = threading.Thread(target=self._play, daemon=True)
+        self._player.start()
+
+    def update(self, scalars: dict[str, float]) -> None:
+        """Take an iteration's scalars, as `Trainer.learn` reports them."""
+        began = time.perf_counter()
+        self._set_time()
+        for name, value in scalars.items():
+            self._stream.log(f"training/{name}", rr.Scalars(value))
+        if self._spent <= self._budget * (began - self._start):
+            self._walk()
+        self._spent += time.perf_counter() - began
+
+    def close(self) -> None:
+        """Stop the thread."""
+        self._closing.set()
+        self._player.join()
+
+    def _walk(self) -> None:
+        trainer, env = self._trainer, self._env
+        actor = {name: value.cpu() for name, value in trainer.learner.get_policy().state_dict().items()}
+        now = Checkpoint(Path("live"), trainer.task, env.cfg, trainer.iteration, trainer.samples, {"actor_state_dict": actor})
+        env.set_progress(trainer.samples)
+        with torch.inference_mode():
+            env.reset()
+        with torch.random.fork_rng(devices=[]):  # new networks draw weights before they are given the learner's
+            policy = load_policy(now, "cpu")
+        rollout = roll_out(env, policy, round(SECONDS / env.step_dt))
+        every = round(1.0 / (FPS * env.step_dt))
+        qpos = rollout.qpos[::every].astype(float)
+        qpos[..., 1] += LANE * (0.5 * (WORLDS - 1) - np.arange(WORLDS))
+        poses = link_poses(self._urdf, qpos.reshape(-1, 13))
+        frames = {link: pose.reshape(len(qpos), WORLDS, 4, 4) for link, pose in poses.items()}
+        self._frames = [{link: pose[i] for link, pose in frames.items()} for i in range(len(qpos))]
+
+    def _play(self) -> None:
+        """Log the latest walk in real time, over and over, until `close`."""
+        shown, frame = self._frames, 0
+        while not self._closing.wait(1.0 / FPS):
+            if frame >= len(shown):
+                shown, frame = self._frames, 0
+            if shown:
+                self._set_time()
+                for link, pose in shown[frame].items():
+                    poses = rr.InstancePoses3D(translations=pose[:, :3, 3], mat3x3=pose[:, :3, :3])
+                    self._stream.log(f"world/{link}", poses)
+                frame += 1
+
+    def _set_time(self) -> None:
+        """Set the calling thread's time: samples, which the viewer follows, and seconds, which can be played again."""
+        self._stream.set_time("samples", sequence=self._trainer.samples)
+        self._stream.set_time("time", duration=time.perf_counter() - self._start)
+
+
+def _entities(names: tuple[str, ...]) -> list[str]:
+    return [f"/training/{name}" for name in names] or ["/training/reward/**"]
