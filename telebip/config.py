@@ -58,7 +58,7 @@ class EpisodeConfig:
 class ActionConfig:
     hip_roll: float = quantity("rad", gt=0)
     hip_pitch: float = quantity("rad", gt=0)
-    knee: float = quantity("m", gt=0)
+    knee: float = quantity("m | rad", gt=0)
 
 
 @dataclass
@@ -99,6 +99,13 @@ class FootRewardConfig:
     k_foot: float = quantity()
     gamma: float = quantity(gt=0, le=1)
     first: Literal["newest", "oldest"] = MISSING
+    cap: float = quantity("body weights", gt=0)
+
+
+@dataclass
+class EnergyRewardConfig:
+    k_energy: float = quantity("s/m", le=0)
+    ramp: tuple[float, float] = quantity("samples", ge=0)
 
 
 @dataclass
@@ -112,6 +119,7 @@ class RewardConfig:
     diff: DiffRewardConfig = section(DiffRewardConfig)
     tq: TqRewardConfig = section(TqRewardConfig)
     foot: FootRewardConfig = section(FootRewardConfig)
+    energy: EnergyRewardConfig = section(EnergyRewardConfig)
     termination: TerminationRewardConfig = section(TerminationRewardConfig)
 
 
@@ -163,9 +171,12 @@ class PpoConfig:
     max_grad_norm: float = quantity(gt=0)
     hidden_dims: list[int] = quantity(ge=1)
     activation: Literal["elu", "relu", "selu", "tanh"] = MISSING
+    symmetry: Literal["none", "phase"] = MISSING
     obs_normalization: bool = MISSING
     init_std: float = quantity(gt=0)
     min_std: float = quantity(gt=0)
+    final_min_std: float = quantity(gt=0)
+    min_std_ramp: tuple[float, float] = quantity("samples", ge=0)
     mixed_precision: Literal["auto", "always", "never"] = MISSING
     save_interval: int = quantity(ge=1)
 
@@ -240,7 +251,7 @@ def _layers(task: str, named_at: str = "", below: tuple[Path, ...] = ()) -> list
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"{named_at}{_shown(path)}: {error}") from error
-    leaves = _parse_yaml(text, _shown(path))
+    leaves = [_from_its_folder(leaf, path) for leaf in _parse_yaml(text, _shown(path))]
     for key, value, where in leaves:
         if key == "base":
             if not isinstance(value, str):
@@ -248,6 +259,14 @@ def _layers(task: str, named_at: str = "", below: tuple[Path, ...] = ()) -> list
             own = [leaf for leaf in leaves if leaf[0] != "base"]
             return [*_layers(value, f"{where}: ", (*below, path)), own]
     return [leaves]
+
+
+def _from_its_folder(leaf: Leaf, file: Path) -> Leaf:
+    """Let a task file name the robot that lies beside it, whatever the working directory."""
+    key, value, where = leaf
+    if key == "sim.robot" and isinstance(value, str) and (file.parent / value).is_file():
+        return key, str((file.parent / value).resolve()), where
+    return leaf
 
 
 def _task_path(task: str, named_at: str) -> Path:

@@ -11,6 +11,7 @@ from telebip.mdp import gait, terminations
 from telebip.mdp.actions import joint_targets
 from telebip.mdp.commands import hold_heading, sample_commands
 from telebip.mdp.context import StepContext
+from telebip.mdp.curriculum import ramp
 from telebip.mdp.observations import heading_relative_quat, noise_amplitude, observation
 from telebip.mdp.randomization import initial_state, sample_pushes, uniform
 from telebip.mdp.rewards import REWARDS
@@ -32,6 +33,7 @@ class TelebipEnv(VecEnv):
         robot: Robot,
         device: str | torch.device = "cpu",
         backend: Backend = "auto",
+        keep_final_obs: bool = False,
     ) -> None:
         """Create and reset the worlds.
 
@@ -40,11 +42,13 @@ class TelebipEnv(VecEnv):
             robot: from `telebip.robot.load_robot(cfg.sim.robot)`.
             device: where tensors live.
             backend: physics engine, see `telebip.sim.make_simulator`.
+            keep_final_obs: whether `step` also returns what ending episodes saw last, before their worlds were reset.
         """
         self.cfg: TaskConfig = cfg
         self.robot = robot
         self.device: torch.device = torch.device(device)
         self.num_envs, self.num_actions = cfg.num_envs, 6
+        self._keep_final_obs = keep_final_obs
         self.sim = make_simulator(backend, robot, self.num_envs, cfg.sim.decimation, self.device, ("geom_friction",))
         self.step_dt = cfg.sim.decimation * robot.physics_dt  # [s]
         self.max_episode_length: int = max(1, round(cfg.episode.length / self.step_dt))  # policy steps
@@ -69,12 +73,14 @@ class TelebipEnv(VecEnv):
         self.command = zeros(3)  # what the policy sees: the target command and the heading hold's correction
         self.target_command = zeros(3)
         self.reference_heading = zeros()  # [rad]
+        self.reward_terms = torch.zeros(len(REWARDS), self.num_envs, device=self.device)  # of the last step
         self.push_wrench_w = zeros(6)  # on the trunk's centre of mass, world frame [N, N m]
         self._push_timer = zeros()  # time until the next push starts [s]
         self._push_time_left = zeros()  # of the present push [s]
         self._command_timer = zeros()  # time until the next command [s]
         self._foot_window = zeros(window)
         self._base_lin_vel_b = zeros(3)
+        self._energy_share = torch.ones((), device=self.device)
         self._command_is_fixed = False
 
         self.reset()
@@ -89,9 +95,17 @@ class TelebipEnv(VecEnv):
 
     def set_command(self, lin_vel_x: float, lin_vel_y: float, ang_vel_z: float) -> None:
         """Give every world this command [m/s, m/s, rad/s], for good: no random ones are drawn any more."""
+        self.set_commands(torch.tensor([lin_vel_x, lin_vel_y, ang_vel_z]).expand(self.num_envs, -1))
+
+    def set_commands(self, commands: Tensor) -> None:
+        """Give each world its row of `commands` (num_envs, 3) [m/s, m/s, rad/s], for good."""
         self._command_is_fixed = True
-        self.target_command.copy_(torch.tensor([lin_vel_x, lin_vel_y, ang_vel_z]).expand(self.num_envs, -1))
+        self.target_command.copy_(commands)
         self._update_commands()
+
+    def set_progress(self, samples: float) -> None:
+        """Bring the curriculum to where a training stands after `samples` environment steps; a new one is complete."""
+        self._energy_share.fill_(ramp(samples, self.cfg.reward.energy.ramp))
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
         """Apply `actions` (num_envs, 6) for one policy step.
@@ -99,6 +113,7 @@ class TelebipEnv(VecEnv):
         Returns:
             Observations {"policy": (num_envs, 33)}, rewards (num_envs,), dones (num_envs,) bool, and extras: `time_outs`
             (num_envs,) bool, and `log`, a dictionary of scalars on the device: each reward term's mean, errors and faults.
+            With `keep_final_obs` also `final_obs`, observations from before any reset.
 
         Raises:
             ValueError: `actions` has another shape.
@@ -116,7 +131,7 @@ class TelebipEnv(VecEnv):
         self._command_timer -= self.step_dt
         self.reference_heading.copy_(wrap_angle(self.reference_heading + self.step_dt * self.target_command[:, 2]))
         self._base_lin_vel_b.copy_(rotate_inverse(state.base_quat, state.base_lin_vel_w))
-        sample = gait.foot_sample(self.phase, state.foot_force, self.robot.weight)
+        sample = gait.foot_sample(self.phase, state.foot_force, self.robot.weight, cfg.reward.foot.cap)
         self._foot_window.copy_(gait.push_sample(self._foot_window, sample))
 
         # 3. Terminations. A world with a non-finite state ends its episode like a fall, and is counted as a fault.
@@ -133,21 +148,28 @@ class TelebipEnv(VecEnv):
             action=actions,
             last_action=self.last_action,
             force_limit=self._force_limit,
+            weight=self.robot.weight,
             foot_window=self._foot_window,
             foot_weights=self._foot_weights,
+            energy_share=self._energy_share,
             fallen=terminated,
         )
         terms = torch.stack([term(context, cfg.reward) for term in REWARDS.values()])
         terms = torch.where(fault & ~torch.isfinite(terms), 0.0, terms)
+        self.reward_terms.copy_(terms)
         rewards = terms.sum(0)
         log = self._log(context, terms, fault)
         self.last_action.copy_(actions)
 
         # 5. Reset finished worlds, draw new commands where they are due, observe.
+        extras = {"time_outs": time_outs, "log": log}
+        if self._keep_final_obs:
+            self._hold_heading()
+            extras["final_obs"] = self.get_observations()
         self._reset(dones)
         self._base_lin_vel_b.copy_(rotate_inverse(state.base_quat, state.base_lin_vel_w))
         self._update_commands()
-        return self.get_observations(), rewards, dones, {"time_outs": time_outs, "log": log}
+        return self.get_observations(), rewards, dones, extras
 
     def get_observations(self) -> TensorDict:
         """Return a new {"policy": (num_envs, 33)}, with fresh noise where it is enabled; see `mdp.observations.LAYOUT`."""
@@ -200,8 +222,12 @@ class TelebipEnv(VecEnv):
             due = self._command_timer < 0.5 * self.step_dt
             self.target_command.copy_(torch.where(due[:, None], new, self.target_command))
             self._command_timer.copy_(torch.where(due, cfg.resampling_time, self._command_timer))
+        self._hold_heading()
+
+    def _hold_heading(self) -> None:
+        """Turn the target command's yaw rate towards the reference heading."""
         heading = yaw(self.sim.state.base_quat)
-        gain, limit = cfg.heading_gain, cfg.heading_limit
+        gain, limit = self.cfg.command.heading_gain, self.cfg.command.heading_limit
         self.command.copy_(hold_heading(self.target_command, heading, self.reference_heading, gain, limit))
 
     def _log(self, context: StepContext, terms: Tensor, fault: Tensor) -> dict[str, Tensor]:

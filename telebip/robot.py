@@ -42,11 +42,12 @@ class Robot:
 def load_robot(path: str | Path) -> Robot:
     """Load a six-actuator biped; relative paths start at the working directory, then at telebip's own folder.
 
-    The MJCF must name the free-floating body `trunk`, the geom `floor`, the joints of `JOINTS` with one actuator each of the
-    same name, a touch sensor `<foot>_force` for each of `FEET`, and the keyframe `home`.
+    The MJCF must name the body `trunk` with a free joint, the joints of `JOINTS` with a range and one position actuator of the
+    same name each, a touch sensor `<foot>_force` for each of `FEET`, the geom `floor`, and the keyframe `home`; see
+    docs/your_robot.md.
 
     Raises:
-        UserError: the file is missing or is no valid MJCF, or a name is missing; the message says which.
+        UserError: the file is missing or is no valid MJCF, or something is missing or of another kind; the message says what.
     """
     file = next((p for p in (Path(path), ROOT / path) if p.is_file()), None)
     if file is None:
@@ -61,12 +62,7 @@ def load_robot(path: str | Path) -> Robot:
     floor = _id(model, "geom", FLOOR, path)
     sensors = [_id(model, "sensor", f"{foot}_force", path) for foot in FEET]
     home = model.key(_id(model, "key", KEYFRAME, path))
-    if (model.nq, model.nv, model.nu) != (13, 12, 6) or list(model.jnt_qposadr[joints]) != list(range(7, 13)):
-        raise UserError(f"{path}: expected a free joint followed by {', '.join(JOINTS)}, in this order, with one actuator each")
-    if list(actuators) != list(range(6)) or list(model.actuator_trnid[:, 0]) != joints:
-        raise UserError(f"{path}: actuators must drive {', '.join(JOINTS)}, in this order")
-    if not model.actuator_forcelimited.all():
-        raise UserError(f"{path}: every actuator needs a forcerange")
+    _check(model, trunk, joints, actuators, sensors, path)
     return Robot(
         path=file,
         model=model,
@@ -79,6 +75,30 @@ def load_robot(path: str | Path) -> Robot:
         floor_id=floor,
         foot_sensor_adr=(int(model.sensor_adr[sensors[0]]), int(model.sensor_adr[sensors[1]])),
     )
+
+
+def _check(
+    model: mujoco.MjModel, trunk: int, joints: list[int], actuators: list[int], sensors: list[int], path: str | Path
+) -> None:
+    """Raise a `UserError` unless the named parts are of the kinds and in the order that the MDP takes for granted."""
+    order = ", ".join(JOINTS)
+    if (model.nq, model.nv) != (13, 12) or list(model.jnt_qposadr[joints]) != list(range(7, 13)):
+        raise UserError(f"{path}: expected a free joint followed by {order}, in this order, and no other joints")
+    if model.jnt_bodyid[0] != trunk:
+        raise UserError(f"{path}: the free joint must be that of body '{TRUNK}'")
+    if model.nu != 6 or actuators != list(range(6)) or list(model.actuator_trnid[:, 0]) != joints:
+        raise UserError(f"{path}: expected one actuator each for {order}, in this order, and no others")
+    position = (model.actuator_gainprm[:, 0] > 0) & (model.actuator_biasprm[:, 1] == -model.actuator_gainprm[:, 0])
+    for i, name in enumerate(JOINTS):
+        if not model.jnt_limited[joints[i]]:
+            raise UserError(f"{path}: joint '{name}' needs a range")
+        if not position[i]:
+            raise UserError(f"{path}: actuator '{name}' must be a position actuator: its control is a joint target")
+        if not model.actuator_forcelimited[i]:
+            raise UserError(f"{path}: actuator '{name}' needs a forcerange")
+    for sensor, foot in zip(sensors, FEET, strict=True):
+        if model.sensor_type[sensor] != mujoco.mjtSensor.mjSENS_TOUCH:
+            raise UserError(f"{path}: sensor '{foot}_force' must be a touch sensor")
 
 
 def _id(model: mujoco.MjModel, kind: str, name: str, path: str | Path) -> int:

@@ -5,6 +5,10 @@ from collections.abc import Callable
 import pytest
 import torch
 
+from telebip.viz.opengl import choose_opengl
+
+choose_opengl()  # before the imports below import MuJoCo
+
 from telebip.config import load_task
 from telebip.env import TelebipEnv
 from telebip.robot import Robot, load_robot

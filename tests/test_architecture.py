@@ -15,7 +15,7 @@ LAYERS = [
     {"telebip.sim"},
     {"telebip.mdp"},
     {"telebip.env"},
-    {"telebip.rl", "telebip.control", "telebip.eval", "telebip.viz"},
+    {"telebip.rl", "telebip.control", "telebip.eval", "telebip.viz", "telebip.gym"},
     {"telebip.cli"},
     {"scripts"},
 ]
@@ -67,7 +67,9 @@ def test_imports_point_one_way(file: Path) -> None:
             assert layer(module) <= own, f"{module_name(file)} must not import {module}"
 
 
-@pytest.mark.parametrize(("engine", "owners"), [("mujoco_warp", {"warp"}), ("warp", {"warp"}), ("rerun", {"rerun"})])
+@pytest.mark.parametrize(
+    ("engine", "owners"), [("mujoco_warp", {"warp"}), ("warp", {"warp"}), ("rerun", {"rerun", "blueprint"})]
+)
 def test_an_engine_has_one_owner(engine: str, owners: set[str]) -> None:
     users = {file.stem for file in FILES if any(module.split(".")[0] == engine for module in imports(file))}
     assert users == owners

@@ -11,6 +11,7 @@ from rsl_rl.env import VecEnv
 from worlds import LAST_ACTION, NEVER_FALL, PHASE, HostReads, MakeEnv, observe, put, put_low, random_actions
 
 from telebip.math import wrap_angle
+from telebip.mdp.rewards import REWARDS
 from telebip.robot import Robot
 
 
@@ -109,17 +110,30 @@ def test_a_fall_is_a_termination_and_not_a_time_out_even_at_the_end(make_env: Ma
 
 
 def test_the_reward_is_the_sum_of_its_terms(make_env: MakeEnv) -> None:
-    env = make_env(num_envs=8)
+    env = make_env("reward.energy.k_energy=-0.3", num_envs=8)
     seen: set[str] = set()
     for step, action in enumerate(random_actions(20, 8)):
         if step == 10:
             put_low(env, [0])
         _, rewards, _, extras = env.step(action)
         terms = {key: value for key, value in extras["log"].items() if key.startswith("reward/")}
-        assert set(terms) == {"reward/cmd", "reward/diff", "reward/tq", "reward/foot", "reward/termination"}
+        assert set(terms) == {f"reward/{name}" for name in REWARDS}
         torch.testing.assert_close(rewards.mean(), torch.stack(list(terms.values())).sum(), atol=1e-6, rtol=0.0)
         seen |= {key for key, value in terms.items() if value != 0.0}
     assert seen == set(terms)
+
+
+def test_the_energy_term_grows_with_the_training_and_is_complete_without_one(make_env: MakeEnv) -> None:
+    settings = ("reward.energy.k_energy=-0.3", "reward.energy.ramp=[1000,3000]")
+    energy = []
+    for progress in (0, 2000, 3000, None):
+        env = make_env(*settings, calm=True)
+        if progress is not None:
+            env.set_progress(progress)
+        log = env.step(torch.ones(4, 6))[3]["log"]
+        energy.append(log["reward/energy"].item())
+    assert energy[0] == 0.0 > energy[1]
+    assert energy[1:] == pytest.approx([energy[3] / 2, energy[3], energy[3]])
 
 
 def test_the_observation_after_a_reset_belongs_to_the_new_episode(make_env: MakeEnv) -> None:

@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -17,10 +18,11 @@ class Parser(argparse.ArgumentParser):
     """An argument parser whose errors are one line that names the nearest valid option."""
 
     def __init__(self, description: str, examples: str) -> None:
-        """Create a parser; `examples` closes the `--help` text."""
+        """Create a parser; `examples`, one a line as in `play.py --agent zero`, close the `--help` text."""
         super().__init__(
+            prog=" ".join(["telebip", *sys.argv[1:2]]) if _is_telebip() else None,
             description=description,
-            epilog=f"examples:\n{examples}",
+            epilog="examples:\n" + re.sub(r"^  (\w+)\.py", lambda m: f"  {invocation(m[1])}", examples, flags=re.MULTILINE),
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,
         )
@@ -35,7 +37,16 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Report wrong usage like every other mistake."""
-        raise UserError(f"{message} (see {Path(sys.argv[0]).name} --help)")
+        raise UserError(f"{message} (see {self.prog} --help)")
+
+
+def invocation(command: str) -> str:
+    """Return what to type for a command: `telebip play` where that is how this one was started, else its script."""
+    return f"telebip {command}" if _is_telebip() else f"python scripts/{command}.py"
+
+
+def _is_telebip() -> bool:
+    return Path(sys.argv[0]).stem == "telebip"
 
 
 def run(command: Callable[[], None]) -> NoReturn:

@@ -1,8 +1,6 @@
 """`play.py`: walk a policy, measure it, and record it."""
 
 import argparse
-import os
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,12 +8,18 @@ from telebip.cli.common import Parser, resolve_device
 from telebip.config import TaskConfig, load_task
 from telebip.control.config import split_overrides
 from telebip.errors import UserError
+from telebip.viz.opengl import choose_opengl
 
+CONTROLLERS, AGENTS = ("alip", "dcm"), ("zero", "random")
+SUFFIXES = (".rrd", ".mp4", ".gif", ".png")
 EXAMPLES = """\
+  play.py --checkpoint assets/policies/telebip_flat --viewer rerun
   play.py --checkpoint assets/policies/telebip_flat --record walk.rrd      (then: rerun walk.rrd)
   play.py --checkpoint runs/telebip_flat/2026-01-31_12-00-00 --command 0.7 0 0
+  play.py --checkpoint assets/policies/telebip_flat --viewer mujoco                (steer it: arrow keys, Enter pushes)
   play.py --checkpoint assets/policies/telebip_flat --num-envs 64 --duration 20
   play.py --controller alip --command 0.7 0 0 control.swing_height=0.05    (a model-based walker)
+  play.py --checkpoint assets/policies/telebip_flat --beside alip dcm --record both.mp4
   play.py --agent zero --task telebip_flat --duration 3                    (what the robot does without a policy)
 """
 
@@ -23,22 +27,20 @@ EXAMPLES = """\
 def main(argv: Sequence[str] | None = None) -> None:
     """Parse arguments, walk, and print what was measured."""
     options = _parse(argv)
-    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it when it is imported
+    choose_opengl()
     checkpoint = None
     if options.checkpoint:
         from telebip.rl.checkpoint import load_checkpoint
 
         checkpoint = load_checkpoint(options.checkpoint)
-        task, config, label = checkpoint.task, checkpoint.config, str(checkpoint.path)
+        task, config = checkpoint.task, checkpoint.config
     else:
-        who = f"controller '{options.controller}'" if options.controller else f"agent '{options.agent}'"
-        task, config, label = Path(options.task).stem, load_task(options.task), who
+        task, config = Path(options.task).stem, load_task(options.task)
     command = _command(options.command, config)
-    _play(options, task, _as_played(config, options), command, checkpoint, label)
+    _play(options, task, _as_played(config, options), command, checkpoint)
 
 
-def _play(options: argparse.Namespace, task: str, config: TaskConfig, command, checkpoint, label: str) -> None:
+def _play(options: argparse.Namespace, task: str, config: TaskConfig, command, checkpoint) -> None:
     from rich.console import Console
     from rich.progress import Progress
 
@@ -51,49 +53,82 @@ def _play(options: argparse.Namespace, task: str, config: TaskConfig, command, c
 
     device = resolve_device(options.device)
     robot = load_robot(config.sim.robot)
-    env = TelebipEnv(config, robot, device, options.backend)
-    env.set_command(*command)
-    if checkpoint:
-        from telebip.rl.policy import load_policy
 
-        policy = load_policy(checkpoint, device)
-    elif options.controller:
-        from telebip.control.factory import make_controller
-
-        policy = make_controller(options.controller, env, options.control_overrides)
-    else:
-        policy = _agent(options.agent, env)
     _warn_untrained(console, command, checkpoint)
+    rollouts = []
+    for name in ["RL" if checkpoint else options.controller or options.agent, *options.beside]:
+        env = TelebipEnv(config, robot, device, options.backend)
+        env.set_command(*command)
+        overrides = options.control_overrides if name == options.controller else []
+        policy = _policy(checkpoint if name == "RL" else name, env, overrides)
+        if options.viewer == "mujoco":
+            from telebip.viz.viewer import steer
 
-    steps = max(1, round(options.duration / env.step_dt))
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        walking = bar.add_task("walking", total=steps)
-        rollout = roll_out(env, policy, steps, progress=lambda step: bar.update(walking, completed=step))
-    summary = summarise(rollout, skip=min(5.0, 0.25 * options.duration))
-    console.print(f"{label}: {task}, {summary.worlds} world{'s' if summary.worlds > 1 else ''} x {summary.duration:g} s")
-    console.print(_lines(summary))
-    if options.record and Path(options.record).suffix == ".png":
-        from telebip.viz.picture import strobe
+            return steer(env, policy)
+        steps = max(1, round(options.duration / env.step_dt))
+        with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+            walking = bar.add_task(f"{name} walks", total=steps)
+            rollout = roll_out(env, policy, steps, progress=lambda step, b=bar, w=walking: b.update(w, completed=step))
+        rollouts.append((name.upper() if name in CONTROLLERS else name, rollout))
+        summary = summarise(rollout, skip=min(5.0, 0.25 * options.duration))
+        who = checkpoint.path if name == "RL" else f"{'agent' if name in AGENTS else 'controller'} '{name}'"
+        console.print(f"{who}: {task}, {summary.worlds} world{'s' if summary.worlds > 1 else ''} x {summary.duration:g} s")
+        console.print(_lines(summary))
+    _show(console, options, rollouts, robot)
 
-        strobe(rollout, robot, Path(options.record))
-        console.print(f"drew {options.record}")
-    elif options.record:
+
+def _show(console, options: argparse.Namespace, rollouts, robot) -> None:
+    """Record, film, draw, and open the rerun viewer, as asked."""
+    from rich.progress import Progress
+
+    from telebip.viz.scene import line_up
+
+    actors, urdf = line_up(rollouts, worlds=options.show), robot.path.with_suffix(".urdf")
+    file = Path(options.record) if options.record else None
+    if file and file.suffix == ".rrd":
         from telebip.viz.rerun import record
 
-        record(rollout, robot.path.with_suffix(".urdf"), Path(options.record))
-        console.print(f"recorded {options.record}; look at it with: rerun {options.record}")
+        record(actors, urdf, file)
+        console.print(f"recorded {file}; look at it with: rerun {file}")
+    elif file and file.suffix == ".png":
+        from telebip.viz.picture import strobe
+
+        strobe(actors[0], robot, file)
+        console.print(f"drew {file}")
+    elif file:
+        from telebip.viz.video import film
+
+        with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+            filming = bar.add_task("filming")
+            film(actors, robot, file, progress=lambda frame, total: bar.update(filming, completed=frame, total=total))
+        console.print(f"filmed {file}")
+    if options.viewer == "rerun":
+        from telebip.viz.rerun import show
+
+        show(actors, urdf, options.connect)
+        console.print("shown in the rerun viewer")
 
 
-def _agent(name: str, env):
-    """Return a stand-in for a policy: `zero` holds the nominal pose, `random` draws standard normal actions."""
+def _policy(who, env, overrides: Sequence[str]):
+    """Return the policy of a checkpoint or of a controller, or a stand-in.
+
+    `zero` holds the nominal pose, `random` draws standard normal actions.
+    """
     import torch
 
+    from telebip.control.factory import make_controller
     from telebip.control.policy import Stateless
+    from telebip.rl.policy import load_policy
+
+    if who in CONTROLLERS:
+        return make_controller(who, env, overrides)
 
     shape = (env.num_envs, env.num_actions)
-    if name == "zero":
+    if who == "zero":
         return Stateless(lambda obs: torch.zeros(shape, device=env.device))
-    return Stateless(lambda obs: torch.randn(shape, generator=env.generator, device=env.device))
+    if who == "random":
+        return Stateless(lambda obs: torch.randn(shape, generator=env.generator, device=env.device))
+    return load_policy(who, env.device)
 
 
 def _lines(s) -> str:
@@ -149,10 +184,18 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = Parser("Walk a policy at a given command, measure it, and record it for the rerun viewer.", EXAMPLES)
     who = parser.add_mutually_exclusive_group()
     who.add_argument("--checkpoint", metavar="PATH_OR_RUN", help="a checkpoint file, or a run folder for its newest")
-    who.add_argument("--controller", choices=("alip", "dcm"), help="a model-based walker, see configs/control/")
-    who.add_argument("--agent", choices=("zero", "random"), help="no policy: nominal joint targets, or Gaussian actions")
+    who.add_argument("--controller", choices=CONTROLLERS, help="a model-based walker, see configs/control/")
+    who.add_argument("--agent", choices=AGENTS, help="no policy: nominal joint targets, or Gaussian actions")
     parser.add_argument(
         "--task", metavar="NAME", default="telebip_flat", help="of an --agent or --controller (default: telebip_flat)"
+    )
+    parser.add_argument(
+        "--beside",
+        choices=CONTROLLERS + AGENTS,
+        nargs="+",
+        default=[],
+        metavar="WHO",
+        help="who else walks, on lanes of their own",
     )
     parser.add_argument(
         "--command",
@@ -164,7 +207,10 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--duration", type=float, default=20.0, metavar="S", help="seconds to walk (default: 20)")
     parser.add_argument("--num-envs", metavar="N", default="1", help="worlds; they differ in their start (default: 1)")
     parser.add_argument("--disturb", action="store_true", help="keep the task's pushes, friction and observation noise on")
-    parser.add_argument("--record", metavar="FILE.rrd|FILE.png", help="record the first world for the rerun viewer, or draw it")
+    parser.add_argument("--viewer", choices=("none", "rerun", "mujoco"), default="none", help="see it at once (default: none)")
+    parser.add_argument("--connect", metavar="HOST:PORT", help="a running rerun viewer (default: start one here)")
+    parser.add_argument("--record", metavar="FILE", help="write FILE.rrd for the rerun viewer, FILE.mp4, FILE.gif, or FILE.png")
+    parser.add_argument("--show", type=int, default=4, metavar="N", help="at most so many worlds, side by side (default: 4)")
     parser.add_argument("--seed", metavar="S", help="of the initial states (default: the task's)")
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto, which prefers CUDA)")
     parser.add_argument("--backend", default="auto", choices=("auto", "native", "warp"), help="physics engine (default: auto)")
@@ -185,6 +231,10 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         options.overrides, options.control_overrides = split_overrides(options.overrides)
     if not 0.0 < options.duration <= 3600.0:
         raise UserError(f"--duration must be between 0 and 3600 s, got {options.duration:g}")
-    if options.record and Path(options.record).suffix not in (".rrd", ".png"):
-        raise UserError(f"--record writes FILE.rrd or FILE.png, got '{options.record}'")
+    if options.record and Path(options.record).suffix not in SUFFIXES:
+        raise UserError(f"--record writes one of FILE{', FILE'.join(SUFFIXES)}, got '{options.record}'")
+    if options.show < 1:
+        raise UserError(f"--show must be at least 1, got {options.show}")
+    if options.connect and options.viewer != "rerun":
+        raise UserError("--connect names a rerun viewer; it goes with --viewer rerun")
     return options

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from telebip.cli.common import Parser, resolve_device
+from telebip.cli.common import Parser, invocation, resolve_device
 from telebip.config import TaskConfig, load_task, task_names
 from telebip.errors import UserError
 
@@ -54,11 +54,14 @@ def _train(options: argparse.Namespace, task: str, config: TaskConfig, run_dir: 
     console = Console(highlight=False, soft_wrap=True)
     with console.status("loading torch and the physics engine"):
         from telebip.env import TelebipEnv
+        from telebip.rl.process import prepare_cpu
         from telebip.rl.run import create_run_dir, describe_run
         from telebip.rl.train import Trainer
         from telebip.robot import load_robot
 
     device = resolve_device(options.device)
+    if device.type == "cpu":
+        prepare_cpu()
     robot = load_robot(config.sim.robot)
     with console.status("creating the worlds (the warp backend compiles for a minute or two the first time)"):
         env = TelebipEnv(config, robot, device, options.backend)
@@ -77,12 +80,14 @@ def _train(options: argparse.Namespace, task: str, config: TaskConfig, run_dir: 
     if trainer.iteration:
         console.print(f"resuming after iteration {trainer.iteration} of {total}")
 
-    with _stop_on_signal(console) as stop, _progress_bar(console, trainer) as show:
+    with stop_on_signal(console) as stop, progress_bar(console, trainer) as show:
         trainer.learn(stop, show)
     finished = trainer.iteration >= total
     if not finished:
-        console.print(f"stopped after iteration {trainer.iteration} of {total}; go on with: train.py --resume {run_dir}")
-    console.print(f"see it walk: python scripts/play.py --checkpoint {run_dir}")
+        console.print(
+            f"stopped after iteration {trainer.iteration} of {total}; go on with: {invocation('train')} --resume {run_dir}"
+        )
+    console.print(f"see it walk: {invocation('play')} --checkpoint {run_dir}")
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -109,7 +114,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
 
 
 @contextmanager
-def _stop_on_signal(console):
+def stop_on_signal(console):
     """Yield a function that tells whether to stop: one Ctrl-C ends the run after its iteration, a second one at once."""
     asked = False
 
@@ -129,7 +134,7 @@ def _stop_on_signal(console):
 
 
 @contextmanager
-def _progress_bar(console, trainer):
+def progress_bar(console, trainer):
     """Yield a function that shows an iteration's scalars: a live bar on a terminal, else one line per fiftieth of the run."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 

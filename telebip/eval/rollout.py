@@ -1,6 +1,7 @@
 """Walk a policy and keep what happened, as plain arrays for measuring, plotting and recording."""
 
-from collections.abc import Callable
+import dataclasses
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,8 +9,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from telebip.config import TaskConfig, load_task
 from telebip.control.policy import Policy
 from telebip.env import TelebipEnv
+from telebip.sim import SimState
 
 
 @dataclass(frozen=True)
@@ -23,18 +26,40 @@ class Rollout:
     joint_target: NDArray[np.float32]  # (steps, num_envs, 6) [rad | m]
     joint_force: NDArray[np.float32]  # (steps, num_envs, 6), mean over the step [N m | N]
     joint_power: NDArray[np.float32]  # (steps, num_envs, 6), mean of |force x velocity| over the step [W]
+    joint_net_power: NDArray[np.float32]  # (steps, num_envs, 6), mean of force x velocity over the step [W]
     foot_force: NDArray[np.float32]  # (steps, num_envs, 2), right and left, mean over the step [N]
     push_w: NDArray[np.float32]  # (steps, num_envs, 3): push on the trunk, world frame [N]
     phase: NDArray[np.float32]  # (steps, num_envs, 2): p_r, p_l
     command: NDArray[np.float32]  # (steps, num_envs, 3): the target command, without the heading hold [m/s, m/s, rad/s]
     reference_heading: NDArray[np.float32]  # (steps, num_envs) [rad]
     reward: NDArray[np.float32]  # (steps, num_envs)
+    reward_terms: NDArray[np.float32]  # (steps, num_envs, terms), in the order of `REWARDS`; their sum is `reward`
     fallen: NDArray[np.bool_]  # (steps, num_envs): the episode ended here by a fall or a fault
 
     @property
     def time(self) -> NDArray[np.floating]:
         """Time of each row [s], (steps,)."""
         return self.step_dt * np.arange(1, len(self.qpos) + 1)
+
+    def after(self, skip: float) -> "Rollout":
+        """Return the rows after the first `skip` seconds, at least one; their `time` starts anew."""
+        first = min(round(skip / self.step_dt), len(self.time) - 1)
+        return self._map(lambda array: array[first:])
+
+    def select(self, worlds: slice) -> "Rollout":
+        """Return some of the worlds."""
+        return self._map(lambda array: array[:, worlds])
+
+    def _map(self, part: Callable[[np.ndarray], np.ndarray]) -> "Rollout":
+        arrays = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in ("step_dt", "weight")}
+        return dataclasses.replace(self, **{name: part(array) for name, array in arrays.items()})
+
+
+def as_evaluated(config: TaskConfig, num_envs: int, duration: float, overrides: Sequence[str] = ()) -> TaskConfig:
+    """Return a task for measuring `duration` s: no pushes, nominal friction, no noise, starts that face x, no time-outs."""
+    calm = [f"disturbance.{name}.enabled=false" for name in ("push", "friction", "noise")]
+    start = [f"num_envs={num_envs}", f"episode.length={duration + 1.0}", "episode.reset_heading=0"]
+    return load_task(config, [*start, *calm, *overrides])
 
 
 def roll_out(env: TelebipEnv, policy: Policy, steps: int, progress: Callable[[int], None] = lambda step: None) -> Rollout:
@@ -55,11 +80,12 @@ def roll_out(env: TelebipEnv, policy: Policy, steps: int, progress: Callable[[in
             obs, reward, dones, extras = env.step(policy(obs))
             policy.reset(dones)
             row = {
-                **{name: getattr(env.sim.state, name) for name in ("qpos", "qvel", "joint_force", "joint_power", "foot_force")},
+                **{field.name: getattr(env.sim.state, field.name) for field in dataclasses.fields(SimState)},
                 "joint_target": env.joint_target,
                 "phase": env.phase,
                 "reference_heading": env.reference_heading,
                 "push_w": env.push_wrench_w[:, :3],
+                "reward_terms": env.reward_terms.T,
             }
             rows.append({name: value.clone() for name, value in row.items()})
             rows[-1] |= {"command": command, "reward": reward, "fallen": dones & ~extras["time_outs"]}

@@ -1,10 +1,12 @@
-"""How well a robot walked: speed, heading, cost of transport, falls, and the rhythm of its feet."""
+"""How well a robot walked: speed, heading, cost of transport and falls."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from telebip.eval.gait import rhythm
 from telebip.eval.rollout import Rollout
 
 Array = NDArray[np.floating]
@@ -20,37 +22,50 @@ class WalkSummary:
     command: tuple[float, float, float]  # m/s, m/s, rad/s
     speed: tuple[float, float]  # forward and leftward along the heading [m/s]
     speed_spread: float  # standard deviation of the worlds' mean forward speeds [m/s]
+    speed_ci95: float  # half width of the 95 % interval of the mean forward speed over worlds [m/s]
     lin_vel_error: float  # mean ||v_cmd - v||, with the velocity along and to the left of the heading [m/s]
+    lin_vel_rms_error: float  # root of the mean of ||v_cmd - v||^2 [m/s]
     yaw_rate: float  # rad/s
     yaw_drift_deg: float  # mean absolute deviation from the reference heading at the end [deg]
-    cost_of_transport: float  # see `cost_of_transport`
+    cost_of_transport: float  # of |power|, see `cost_of_transport`
     cost_of_transport_article: float  # the article's formula, see there
-    gait_period: float  # see `gait_period` [s]
+    cost_of_transport_positive: float  # of positive power alone: braking costs nothing and gives nothing back
+    joint_cost_of_transport: tuple[float, ...]  # of |power|, each actuator's share, in the order of `robot.JOINTS`
+    gait_period: float  # see `telebip.eval.gait.rhythm` [s]
     falls: int
+    worlds_fallen: int  # of which there are at most `worlds`
 
 
 def summarise(rollout: Rollout, skip: float) -> WalkSummary:
     """Summarise a rollout, leaving out its first `skip` seconds, in which the robot gathers speed (falls count throughout)."""
-    kept = slice(min(round(skip / rollout.step_dt), len(rollout.time) - 1), None)
-    velocity = heading_velocity(rollout.qpos[kept], rollout.qvel[kept])
-    power = rollout.joint_power[kept].sum(-1)
-    command = rollout.command[kept].mean((0, 1), dtype=float)
-    error = np.linalg.norm(rollout.command[kept][..., :2] - velocity, axis=-1)
+    kept = rollout.after(skip)
+    velocity = heading_velocity(kept.qpos, kept.qvel)
+    positive = 0.5 * (kept.joint_power + kept.joint_net_power)  # max(x, 0) = (|x| + x) / 2
+    command = kept.command.mean((0, 1), dtype=float)
+    error = np.linalg.norm(kept.command[..., :2] - velocity, axis=-1)
     drift = _wrap(_yaw(rollout.qpos[-1, :, 3:7]) - rollout.reference_heading[-1])
+    speeds = velocity[..., 0].mean(0, dtype=float)
+    worlds = len(speeds)
+    joints = tuple(cost_of_transport(kept.joint_power[..., i], velocity, rollout.weight) for i in range(6))
     return WalkSummary(
-        worlds=rollout.qpos.shape[1],
+        worlds=worlds,
         duration=float(rollout.time[-1]),
-        skipped=kept.start * rollout.step_dt,
+        skipped=(len(rollout.time) - len(kept.time)) * rollout.step_dt,
         command=(float(command[0]), float(command[1]), float(command[2])),
-        speed=(float(velocity[..., 0].mean()), float(velocity[..., 1].mean())),
-        speed_spread=float(velocity[..., 0].mean(0).std()),
+        speed=(float(speeds.mean()), float(velocity[..., 1].mean(dtype=float))),
+        speed_spread=float(speeds.std()),
+        speed_ci95=1.96 * float(speeds.std(ddof=1)) / math.sqrt(worlds) if worlds > 1 else float("nan"),
         lin_vel_error=float(error.mean()),
-        yaw_rate=float(rollout.qvel[kept][..., 5].mean()),
+        lin_vel_rms_error=float(np.sqrt((error**2).mean())),
+        yaw_rate=float(kept.qvel[..., 5].mean()),
         yaw_drift_deg=float(np.degrees(np.abs(drift)).mean()),
-        cost_of_transport=cost_of_transport(power, velocity, rollout.weight),
-        cost_of_transport_article=cost_of_transport_article(power, velocity, rollout.weight),
-        gait_period=gait_period(rollout.foot_force[kept], rollout.step_dt),
+        cost_of_transport=sum(joints),
+        cost_of_transport_article=sum(joints) + 1.0 / rollout.weight,
+        cost_of_transport_positive=cost_of_transport(positive.sum(-1), velocity, rollout.weight),
+        joint_cost_of_transport=joints,
+        gait_period=rhythm(kept.foot_force, rollout.step_dt)[0],
         falls=int(rollout.fallen.sum()),
+        worlds_fallen=int(rollout.fallen.any(0).sum()),
     )
 
 
@@ -62,10 +77,13 @@ def heading_velocity(qpos: Array, qvel: Array) -> Array:
 
 
 def cost_of_transport(power: Array, velocity: Array, weight: float) -> float:
-    r"""Mechanical cost of transport, COT = mean(sum_i |tau_i qd_i|) / (m g mean ||v||).
+    r"""Mechanical cost of transport, COT = mean(P) / (m g mean ||v||), with P = sum_i |tau_i qd_i| unless said otherwise.
+
+    The article's literal formula, COT = (mean(P) + ||v||) / (m g ||v||), adds a speed to a power and is larger by 1 / (m g);
+    it is reported beside ours to be compared with the article's tables.
 
     Args:
-        power: sum_i |tau_i qd_i|, averaged over physics steps [W], (steps, num_envs).
+        power: P, averaged over physics steps [W], (steps, num_envs).
         velocity: horizontal velocity [m/s], (steps, num_envs, 2).
         weight: m g [N].
 
@@ -74,43 +92,6 @@ def cost_of_transport(power: Array, velocity: Array, weight: float) -> float:
     """
     speed = np.linalg.norm(velocity.mean(0), axis=-1).mean()
     return float(power.mean() / (weight * speed)) if speed > 0 else float("inf")
-
-
-def cost_of_transport_article(power: Array, velocity: Array, weight: float) -> float:
-    r"""The article's literal formula, COT = (mean(sum_i |tau_i qd_i|) + ||v||) / (m g ||v||), which is larger by 1 / (m g).
-
-    It adds a speed to a power; it is reported to be compared with the article's tables. Arguments as in `cost_of_transport`.
-    """
-    return cost_of_transport(power, velocity, weight) + 1.0 / weight
-
-
-def gait_period(foot_force: Array, step_dt: float, longest: float = 1.5) -> float:
-    r"""Period of the gait: the lag of the first high peak of the autocorrelation of q_rf - q_lf.
-
-    The difference of the feet alternates in sign within one stride, so that one stride, not one step, is its period.
-
-    Args:
-        foot_force: normal forces on the right and the left foot [N], (steps, num_envs, 2).
-        step_dt: time between rows [s].
-        longest: longest period looked for [s].
-
-    Returns:
-        Period [s], refined between samples by a parabola; NaN if there are fewer than two periods or no rhythm.
-    """
-    signal = foot_force[..., 0] - foot_force[..., 1]
-    signal = signal - signal.mean(0)
-    lags = min(round(longest / step_dt), len(signal) // 2)
-    energy = (signal * signal).mean()
-    if lags < 3 or energy <= 0.0:
-        return float("nan")
-    correlation = np.array([(signal[: len(signal) - k] * signal[k:]).mean() / energy for k in range(lags + 1)])
-    inner = correlation[1:-1]
-    peaks = 1 + np.flatnonzero((inner > correlation[:-2]) & (inner >= correlation[2:]) & (inner > 0.3))
-    if not len(peaks):
-        return float("nan")
-    k = peaks[np.flatnonzero(correlation[peaks] >= 0.9 * correlation[peaks].max())[0]]
-    left, middle, right = correlation[k - 1 : k + 2]
-    return float((k + 0.5 * (left - right) / (left - 2.0 * middle + right)) * step_dt)
 
 
 def _yaw(quat: Array) -> Array:

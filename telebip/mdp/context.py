@@ -17,6 +17,8 @@ class StepContext:
     action: Tensor  # A_t [-], (num_envs, 6)
     last_action: Tensor  # A_{t-1}, (num_envs, 6)
     force_limit: Tensor  # of the six actuators [N m | N], (6,)
+    weight: float  # m g [N]
     foot_window: Tensor  # p_r q_rf + p_l q_lf of the last gait period [-], newest first, (num_envs, window)
     foot_weights: Tensor  # weight of each age in that window [-], (window,)
+    energy_share: Tensor  # how much of the energy term is switched on, 0 to 1 [-], ()
     fallen: Tensor  # bool, (num_envs,)

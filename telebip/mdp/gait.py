@@ -48,18 +48,24 @@ def window_weights(length: int, gamma: float, first: str) -> Tensor:
     return weights if first == "newest" else weights.flip(0)
 
 
-def foot_sample(phase: Tensor, foot_force: Tensor, weight: float) -> Tensor:
-    r"""One sample of the foot reward: p_r q_rf + p_l q_lf, with q the foot's normal force over the robot's weight.
+def foot_sample(phase: Tensor, foot_force: Tensor, weight: float, cap: float) -> Tensor:
+    r"""One sample of the foot reward.
+
+        p_r q_rf + p_l q_lf,    q = min(force / (m g), cap)                                  (article, foot reward; cap: ours)
+
+    A reward proportional to the force pays for pounding: landing hard in phase earns more than carrying the weight steadily.
+    With a cap, all that counts is which foot is on the ground.
 
     Args:
         phase: (p_r, p_l) [-], (num_envs, 2).
         foot_force: normal forces on the right and the left foot [N], (num_envs, 2).
         weight: m g [N]; dividing by it makes the term independent of the robot's size.
+        cap: force that counts at most, in body weights [-]; one that is never reached gives the article's reward.
 
     Returns:
         Sample [-], (num_envs,).
     """
-    return (phase * foot_force).sum(1) / weight
+    return (phase * (foot_force / weight).clamp(max=cap)).sum(1)
 
 
 def push_sample(window: Tensor, sample: Tensor) -> Tensor:

@@ -19,7 +19,8 @@ def uniform(shape: tuple[int, ...], low: float, high: float, generator: torch.Ge
 def initial_state(home_qpos: Tensor, num_envs: int, cfg: EpisodeConfig, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Draw standing states about the home pose, with small velocities and any heading.
 
-    Where a leg comes out longer than at home, the robot is lifted by the difference, so that no foot starts in the ground.
+    Where a leg comes out longer than at home, the robot is lifted by the difference, so that no foot starts in the ground. (A
+    rotary knee is taken for one that lengthens the leg by 1 m per rad: more than it does.)
 
     Args:
         home_qpos: (13,).

@@ -1,4 +1,4 @@
-"""The five reward modules: r = r_cmd + r_diff + r_tq + r_foot + r_T, per policy step.
+"""The reward modules: r = r_cmd + r_diff + r_tq + r_foot + r_T, per policy step, and r_energy, which is ours.
 
 Each term is a pure function; `REWARDS` at the end is the list that the environment sums, beside the YAML that holds every
 coefficient. To add a term: write its function, give it a row in `REWARDS` and its coefficients a place in the configuration.
@@ -101,6 +101,23 @@ def periodic_foot_force(window: Tensor, weights: Tensor, k_foot: float) -> Tenso
     return k_foot * (window @ weights)
 
 
+def energy(joint_power: Tensor, weight: float, k_energy: float) -> Tensor:
+    r"""Penalty on mechanical power: r_energy = k_energy sum_i |tau_i qd_i| / (m g).
+
+    The power over the weight is the speed at which a cost of transport of 1 would be paid for: cost of transport times speed.
+    Not in the article. From the first sample on it teaches a robot that cannot walk yet to hold still, so it is ramped up.
+
+    Args:
+        joint_power: |tau_i qd_i|, mean over the policy step [W], (num_envs, 6).
+        weight: m g [N].
+        k_energy: coefficient, not positive [s/m].
+
+    Returns:
+        Reward [-], (num_envs,).
+    """
+    return k_energy * joint_power.sum(1) / weight
+
+
 def termination(fallen: Tensor, k_termination: float) -> Tensor:
     r"""Penalty on a fall: r_T = k_T where the robot has fallen, else 0. A time-out is not a fall.
 
@@ -122,5 +139,6 @@ REWARDS: dict[str, Callable[[StepContext, RewardConfig], Tensor]] = {
     "diff": lambda s, c: action_difference(s.action, s.last_action, c.diff.k_diff),
     "tq": lambda s, c: torque(s.state.joint_force, s.force_limit, c.tq.k_tq),
     "foot": lambda s, c: periodic_foot_force(s.foot_window, s.foot_weights, c.foot.k_foot),
+    "energy": lambda s, c: s.energy_share * energy(s.state.joint_power, s.weight, c.energy.k_energy),
     "termination": lambda s, c: termination(s.fallen, c.termination.k_termination),
 }

@@ -13,7 +13,7 @@ def fallen(state: SimState, min_hip_height: float) -> Tensor:
 
 def non_finite(state: SimState) -> Tensor:
     """Whether a world's position, velocity or forces hold a NaN or an infinity: bool, (num_envs,)."""
-    parts = (state.qpos, state.qvel, state.foot_force, state.joint_force, state.joint_power)
+    parts = (state.qpos, state.qvel, *state.step_means)
     return ~torch.stack([part.sum(1) for part in parts]).isfinite().all(0)
 
 

@@ -1,4 +1,7 @@
-"""Checkpoints: self-contained, written atomically, and data only (`weights_only=True`): loading one never runs code."""
+"""Checkpoints: self-contained, written atomically, and data only (`weights_only=True`): loading one never runs code.
+
+A policy exported to ONNX is read as a checkpoint too: one that can be walked, but not resumed.
+"""
 
 import os
 import re
@@ -8,12 +11,15 @@ from typing import Any
 
 import torch
 
+from telebip import ROOT
 from telebip.config import TaskConfig, parse_config, to_yaml
 from telebip.errors import UserError
 from telebip.mdp.observations import LAYOUT
+from telebip.rl.onnx import OnnxPolicy
 from telebip.robot import JOINTS
 
 FORMAT = "telebip-checkpoint-1"
+POLICIES = ROOT / "assets" / "policies"
 
 
 @dataclass(frozen=True)
@@ -25,7 +31,12 @@ class Checkpoint:
     config: TaskConfig
     iteration: int  # finished iterations
     samples: int  # environment steps seen in training
-    learner: dict[str, Any]  # state dictionaries as `rsl_rl.algorithms.PPO.save` returns them
+    learner: dict[str, Any]  # state dictionaries as `rsl_rl.algorithms.PPO.save` returns them; none in an ONNX file
+
+    @property
+    def is_onnx(self) -> bool:
+        """Whether the file holds a policy exported to ONNX."""
+        return self.path.suffix == ".onnx"
 
 
 def save_checkpoint(path: Path, task: str, config: TaskConfig, iteration: int, samples: int, learner: dict[str, Any]) -> None:
@@ -46,12 +57,17 @@ def save_checkpoint(path: Path, task: str, config: TaskConfig, iteration: int, s
 
 
 def load_checkpoint(path: str | Path) -> Checkpoint:
-    """Load a checkpoint file, or the newest one of a run folder.
+    """Load a checkpoint file (.pt or .onnx), or the newest one of a run folder.
+
+    Args:
+        path: from the working directory, from telebip's own folder, or the name of a policy that comes with telebip.
 
     Raises:
         UserError: there is none, it is damaged or unsafe, or its observations or actions are laid out differently.
     """
     file = _find(Path(path))
+    if file.suffix == ".onnx":
+        return _load_onnx(file)
     try:
         content = torch.load(file, map_location="cpu", weights_only=True)
     except OSError as error:
@@ -65,19 +81,32 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     missing = {"task", "config", "observation", "action", "iteration", "samples", "actor_state_dict"} - content.keys()
     if missing:
         raise UserError(f"checkpoint '{file}' is not complete: it lacks {', '.join(sorted(missing))}")
-    for part, expected in (("observation", LAYOUT), ("action", list(JOINTS))):
-        if content[part] != expected:
-            raise UserError(f"checkpoint '{file}': its {part} layout {content[part]} differs from this version's {expected}")
+    _check_layout(file, content["observation"], content["action"])
     learner = {key: value for key, value in content.items() if key.endswith("_state_dict")}
     config = parse_config(content["config"], f"{file}:config")
     return Checkpoint(file, content["task"], config, content["iteration"], content["samples"], learner)
 
 
-def _find(path: Path) -> Path:
+def _load_onnx(file: Path) -> Checkpoint:
+    metadata = OnnxPolicy(file).metadata
+    _check_layout(file, {part["name"]: part["size"] for part in metadata["observation"]}, metadata["joint_names"])
+    config = parse_config(metadata["config"], f"{file}:config")
+    return Checkpoint(file, metadata["task"], config, metadata["iteration"], metadata["samples"], learner={})
+
+
+def _check_layout(file: Path, observation: dict[str, int], action: list[str]) -> None:
+    for part, found, expected in (("observation", observation, LAYOUT), ("action", action, list(JOINTS))):
+        if found != expected:
+            raise UserError(f"checkpoint '{file}': its {part} layout {found} differs from this version's {expected}")
+
+
+def _find(given: Path) -> Path:
+    path = next((p for p in (given, ROOT / given, POLICIES / given) if p.exists()), given)
     if path.is_file():
         return path
     if not path.exists():
-        raise UserError(f"checkpoint '{path}' does not exist")
+        shipped = ", ".join(sorted(folder.name for folder in POLICIES.glob("*")))
+        raise UserError(f"checkpoint '{path}' does not exist; policies that come with telebip: {shipped}")
     numbered = {int(m[1]): file for file in path.glob("model_*.pt") if (m := re.fullmatch(r"model_(\d+)\.pt", file.name))}
     if numbered:
         return numbered[max(numbered)]

@@ -11,6 +11,8 @@ from telebip.control.policy import Policy
 from telebip.errors import UserError
 from telebip.mdp.observations import LAYOUT
 from telebip.rl.checkpoint import Checkpoint
+from telebip.rl.onnx import OnnxPolicy
+from telebip.rl.symmetry import SymmetricPolicy
 from telebip.robot import JOINTS
 
 OBS_GROUPS = {"actor": ["policy"], "critic": ["policy"]}
@@ -34,15 +36,29 @@ def critic_cfg(ppo: PpoConfig) -> dict[str, Any]:
 
 
 def load_policy(checkpoint: Checkpoint, device: str | torch.device) -> Policy:
-    """Return the checkpoint's deterministic policy.
+    """Return the checkpoint's deterministic policy: torch's network, or onnxruntime's where the checkpoint is an ONNX file.
 
     Raises:
         UserError: the weights do not fit the configuration they came with.
     """
+    if checkpoint.is_onnx:
+        return OnnxPolicy(checkpoint.path, device)
+    return load_network(checkpoint, device)
+
+
+def load_network(checkpoint: Checkpoint, device: str | torch.device = "cpu") -> MLPModel | SymmetricPolicy:
+    """Return the checkpoint's network in evaluation mode.
+
+    Raises:
+        UserError: it is an ONNX file, or the weights do not fit the configuration they came with.
+    """
+    if checkpoint.is_onnx:
+        raise UserError(f"'{checkpoint.path}' is an ONNX file already; export needs a checkpoint (.pt) or a run folder")
     obs = TensorDict({"policy": torch.zeros(1, sum(LAYOUT.values()))}, batch_size=[1])
     actor = MLPModel(obs, OBS_GROUPS, "actor", len(JOINTS), **actor_cfg(checkpoint.config.ppo))
     try:
         actor.load_state_dict(checkpoint.learner["actor_state_dict"])
     except (RuntimeError, KeyError) as error:
         raise UserError(f"checkpoint '{checkpoint.path}': its weights do not fit its configuration") from error
-    return actor.to(device).eval()
+    policy = SymmetricPolicy(actor, device) if checkpoint.config.ppo.symmetry == "phase" else actor
+    return policy.to(device).eval()

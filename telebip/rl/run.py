@@ -42,7 +42,7 @@ def describe_run(run_dir: Path, config: TaskConfig, device: str, backend: str) -
         "command": sys.argv,
         "device": device,
         "backend": backend,
-        "git_revision": _git("rev-parse", "HEAD"),
+        "git_revision": git_revision(),
         "git_dirty": bool(_git("status", "--porcelain", "--untracked-files=no")),
         "python": platform.python_version(),
         "versions": {"telebip": __version__, **{name: version(name) for name in PACKAGES}},
@@ -52,8 +52,15 @@ def describe_run(run_dir: Path, config: TaskConfig, device: str, backend: str) -
     file.write_text(json.dumps({"starts": [*starts, start]}, indent=2) + "\n", encoding="utf-8")
 
 
+def git_revision() -> str | None:
+    """Return the revision of telebip's repository, or None for an installed package."""
+    return _git("rev-parse", "HEAD")
+
+
 def _git(*arguments: str) -> str | None:
     """Return git's answer about telebip's own repository, or None where there is no git or no repository."""
+    if not (ROOT / ".git").exists():
+        return None  # git would answer about a repository of the user's that happens to surround the installed package
     try:
         done = subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True, timeout=10, check=True)
     except (OSError, subprocess.SubprocessError):

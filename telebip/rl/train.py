@@ -12,14 +12,18 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
-from rsl_rl.algorithms import PPO
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
+from telebip.config import PpoConfig
 from telebip.env import TelebipEnv
 from telebip.errors import UserError
+from telebip.mdp.curriculum import ramp
 from telebip.rl.checkpoint import Checkpoint, save_checkpoint
+from telebip.rl.curve import CurveWriter
 from telebip.rl.policy import OBS_GROUPS, actor_cfg, critic_cfg
+from telebip.rl.ppo import FastPPO
+from telebip.rl.symmetry import SymmetricEnv
 
 
 class Trainer:
@@ -37,7 +41,8 @@ class Trainer:
             )
         torch.manual_seed(env.cfg.seed)
         with contextlib.redirect_stdout(io.StringIO()):  # rsl-rl prints the networks
-            self.learner = PPO.construct_algorithm(env.get_observations(), env, _rsl_rl_cfg(env), str(env.device))
+            self.learner = FastPPO.construct_algorithm(env.get_observations(), env, _rsl_rl_cfg(env), str(env.device))
+        self._view = SymmetricEnv(env) if ppo.symmetry == "phase" else env
         self._episodes = EpisodeStatistics(env.num_envs, env.device)
 
     def resume(self, checkpoint: Checkpoint) -> None:
@@ -57,19 +62,22 @@ class Trainer:
             stop: asked after every iteration.
             report: called after every iteration with what TensorBoard gets.
         """
-        env, learner, cfg = self.env, self.learner, self.env.cfg.ppo
+        env, view, learner, cfg = self.env, self._view, self.learner, self.env.cfg.ppo
         writer = SummaryWriter(str(self.run_dir), purge_step=self.samples + 1)
+        curve = CurveWriter(self.run_dir, self.samples)
         # Spread the time-outs over the iterations.
         ages = torch.randint(env.max_episode_length, (env.num_envs,), generator=env.generator, device=env.device)
         env.episode_length_buf = ages
         learner.train_mode()
-        obs = env.get_observations()
+        obs = view.get_observations()
         while self.iteration < cfg.max_iterations and not stop():
             start = time.perf_counter()
             logs: dict[str, Tensor] = {}
+            env.set_progress(self.samples)
+            learner.get_policy().distribution.std_range[0] = min_std(cfg, self.samples)  # type: ignore[union-attr]
             with torch.inference_mode():
                 for _ in range(cfg.num_steps_per_env):
-                    obs, rewards, dones, extras = env.step(learner.act(obs))
+                    obs, rewards, dones, extras = view.step(learner.act(obs))
                     learner.process_env_step(obs, rewards, dones, extras)
                     self._episodes.add(rewards, dones)
                     logs = {key: logs.get(key, 0) + value for key, value in extras["log"].items()}
@@ -98,6 +106,7 @@ class Trainer:
             }
             for key, value in scalars.items():
                 writer.add_scalar(key, value, self.samples)
+            curve.add({"iteration": self.iteration, "samples": self.samples, **scalars})
             if self.iteration % cfg.save_interval == 0:
                 self.save()
             report(scalars)
@@ -142,6 +151,11 @@ class EpisodeStatistics:
         return (total[0] / total[2], total[1] / total[2]) if total[2] else (float("nan"), float("nan"))
 
 
+def min_std(cfg: PpoConfig, samples: int) -> float:
+    """Return the floor of the action's standard deviation after `samples`: from `min_std` to `final_min_std`, geometrically."""
+    return cfg.min_std * (cfg.final_min_std / cfg.min_std) ** ramp(samples, cfg.min_std_ramp)
+
+
 def uses_bfloat16(mixed_precision: str, device: torch.device) -> bool:
     """Whether the update runs in bfloat16; `auto` asks the device whether it has instructions for it."""
     if mixed_precision != "auto":
@@ -163,7 +177,7 @@ def _rsl_rl_cfg(env: TelebipEnv) -> dict:
         "obs_groups": OBS_GROUPS,
         "multi_gpu": None,
         "algorithm": {
-            "class_name": "PPO",
+            "class_name": FastPPO,
             **{name: getattr(ppo, name) for name in algorithm.split()},
             "use_mixed_precision": uses_bfloat16(ppo.mixed_precision, env.device),
         },

@@ -22,6 +22,7 @@ class SimState:
     foot_force: Tensor  # (num_envs, 2): normal ground force on the right and the left foot [N]
     joint_force: Tensor  # (num_envs, 6): actuator force [N m | N]
     joint_power: Tensor  # (num_envs, 6): |actuator force x joint velocity| [W]
+    joint_net_power: Tensor  # (num_envs, 6): actuator force x joint velocity, negative where the actuator brakes [W]
 
     @property
     def base_pos(self) -> Tensor:
@@ -53,10 +54,15 @@ class SimState:
         """Joint velocities [rad/s | m/s], (num_envs, 6)."""
         return self.qvel[:, 6:]
 
+    @property
+    def step_means(self) -> tuple[Tensor, ...]:
+        """The buffers that hold means over a policy step."""
+        return self.foot_force, self.joint_force, self.joint_power, self.joint_net_power
+
     @staticmethod
     def zeros(num_envs: int, device: torch.device) -> "SimState":
         """Allocate the buffers."""
-        return SimState(*(torch.zeros(num_envs, size, device=device) for size in (13, 12, 2, 6, 6)))
+        return SimState(*(torch.zeros(num_envs, size, device=device) for size in (13, 12, 2, 6, 6, 6)))
 
 
 class Simulator(Protocol):

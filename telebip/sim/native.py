@@ -63,7 +63,9 @@ class NativeSimulator:
         self.state.qvel.copy_(self._qvel)
         self.state.foot_force.copy_(self._sensors[:, :, self._foot_adr].mean(1))
         self.state.joint_force.copy_(self._force.mean(1))
-        self.state.joint_power.copy_((self._force * self._velocity).abs_().mean(1))
+        power = self._force * self._velocity
+        self.state.joint_net_power.copy_(power.mean(1))
+        self.state.joint_power.copy_(power.abs_().mean(1))
         return self.state
 
     def reset(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
@@ -71,5 +73,5 @@ class NativeSimulator:
         rows = mask[:, None]
         for target, value in ((self._qpos, qpos), (self._qvel, qvel), (self.state.qpos, qpos), (self.state.qvel, qvel)):
             target.copy_(torch.where(rows, value.to(target.dtype), target))
-        for target in (self._warmstart, self._time, self.state.foot_force, self.state.joint_force, self.state.joint_power):
+        for target in (self._warmstart, self._time, *self.state.step_means):
             target.masked_fill_(rows if target.dim() == 2 else mask, 0.0)

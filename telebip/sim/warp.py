@@ -28,13 +28,16 @@ def _accumulate(
     scale: float,
     joint_force: wp.array2d[float],
     joint_power: wp.array2d[float],
+    joint_net_power: wp.array2d[float],
     foot_force: wp.array2d[float],
 ):
     """Add one physics step's share, `scale` = 1 / decimation, to the means over a policy step."""
     world, i = wp.tid()  # type: ignore[misc]
     force = actuator_force[world, i]
     joint_force[world, i] += scale * force
-    joint_power[world, i] += scale * wp.abs(force * actuator_velocity[world, i])
+    power = force * actuator_velocity[world, i]
+    joint_power[world, i] += scale * wp.abs(power)
+    joint_net_power[world, i] += scale * power
     if i == 0:
         foot_force[world, 0] += scale * sensordata[world, right_adr]
         foot_force[world, 1] += scale * sensordata[world, left_adr]
@@ -83,8 +86,12 @@ class WarpSimulator:
             foot_force=torch.zeros(num_envs, 2, device=device),
             joint_force=torch.zeros(num_envs, 6, device=device),
             joint_power=torch.zeros(num_envs, 6, device=device),
+            joint_net_power=torch.zeros(num_envs, 6, device=device),
         )
-        self._means = [wp.from_torch(t) for t in (self.state.joint_force, self.state.joint_power, self.state.foot_force)]
+        state = self.state
+        self._means = [
+            wp.from_torch(mean) for mean in (state.joint_force, state.joint_power, state.joint_net_power, state.foot_force)
+        ]
         self._ctrl, self._warmstart, self._time = (
             wp.to_torch(a) for a in (self._data.ctrl, self._data.qacc_warmstart, self._data.time)
         )
@@ -109,7 +116,7 @@ class WarpSimulator:
         rows = mask[:, None]
         self.state.qpos.copy_(torch.where(rows, qpos, self.state.qpos))
         self.state.qvel.copy_(torch.where(rows, qvel, self.state.qvel))
-        for target in (self._warmstart, self._time, self.state.foot_force, self.state.joint_force, self.state.joint_power):
+        for target in (self._warmstart, self._time, *self.state.step_means):
             target.masked_fill_(rows if target.dim() == 2 else mask, 0.0)
 
     def _launch(self) -> None:

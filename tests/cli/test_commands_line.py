@@ -12,7 +12,7 @@ import torch
 
 from telebip import ROOT
 
-TRAIN, PLAY = "scripts/train.py", "scripts/play.py"
+TRAIN, PLAY, GALLERY = "scripts/train.py", "scripts/play.py", "scripts/gallery.py"
 TINY = ("--num-envs", "8", "--device", "cpu", "ppo.num_steps_per_env=5", "ppo.hidden_dims=[16,16]")
 
 
@@ -48,9 +48,13 @@ def refusal(script: str, *arguments: str) -> str:
         ([TRAIN, "--task", "telebip_flat", "--num-env", "8"], ["--num-env", "did you mean '--num-envs'?"]),
         ([TRAIN], ["--task", "telebip_flat"]),
         ([PLAY, "--agent", "zero", "--duration", "-1"], ["--duration", "-1"]),
-        ([PLAY, "--agent", "zero", "--record", "foo.txt"], ["--record", "foo.txt", ".rrd"]),
+        ([PLAY, "--agent", "zero", "--record", "foo.txt"], ["--record", "foo.txt", ".rrd", ".mp4"]),
+        ([GALLERY, "--only", "waling.gif"], ["waling.gif", "did you mean 'walking.gif'?"]),
+        ([PLAY, "--agent", "zero", "--show", "0"], ["--show", "at least 1"]),
+        ([PLAY, "--agent", "zero", "--connect", "localhost"], ["--connect", "--viewer rerun"]),
+        ([PLAY, "--agent", "zero", "--viewer", "mujco"], ["--viewer", "mujco", "mujoco"]),
     ],
-    ids=lambda value: " ".join(value[1:]) if value[0] in (TRAIN, PLAY) else "",
+    ids=lambda value: " ".join(value[1:]) if value[0] in (TRAIN, PLAY, GALLERY) else "",
 )
 def test_a_mistake_is_one_line_that_names_it(arguments: list[str], named: list[str]) -> None:
     line = refusal(*arguments)
@@ -113,10 +117,20 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_trained_policy_can_be_played_and_recorded(run_dir: Path) -> None:
     assert {"model_2.pt", "policy.pt", "config.yaml", "run.json"} <= {path.name for path in run_dir.iterdir()}
     record = run_dir / "walk.rrd"
-    text = ran(PLAY, "--checkpoint", str(run_dir), "--duration", "1", "--record", str(record), "--device", "cpu")
-    assert "telebip_slow, 1 world x 1 s" in text
+    others = ("--beside", "zero", "random")
+    text = ran(PLAY, "--checkpoint", str(run_dir), "--duration", "1", "--record", str(record), "--device", "cpu", *others)
+    assert "model_2.pt: telebip_slow, 1 world x 1 s" in text
+    assert "agent 'zero': telebip_slow, 1 world x 1 s" in text
+    assert "agent 'random': telebip_slow, 1 world x 1 s" in text
     assert "0.55 m/s forward" in text  # the middle of telebip_slow's 0.4 to 0.7
     assert record.stat().st_size > 10_000
+
+
+def test_pictures_are_made_anew(tmp_path: Path) -> None:
+    text = ran(GALLERY, "--only", "control_loop.png", "stride.png", "--out", str(tmp_path))
+    assert [line.split(":")[0] for line in text.splitlines()] == [f"{tmp_path}/control_loop.png", f"{tmp_path}/stride.png"]
+    for name in ("control_loop.png", "stride.png"):
+        assert 10_000 < (tmp_path / name).stat().st_size < 300_000
 
 
 def test_a_run_goes_on_in_its_folder(run_dir: Path) -> None:

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from telebip.control.policy import Stateless
 from telebip.env import TelebipEnv
 from telebip.eval.rollout import Rollout, roll_out
-from telebip.eval.walk import cost_of_transport, cost_of_transport_article, gait_period, heading_velocity, summarise
+from telebip.eval.walk import cost_of_transport, heading_velocity, summarise
+from telebip.mdp.rewards import REWARDS
 
 STEP_DT, WEIGHT = 0.02, 130.0  # s, N
 
@@ -25,8 +26,18 @@ def facing(angle: float | NDArray[np.floating]) -> NDArray[np.floating]:
 
 def walk(steps: int = 200, worlds: int = 2, **replaced: Any) -> Rollout:
     """Return a rollout that stands still facing x, with the given arrays in place of zeros (they broadcast)."""
-    sizes = {"qpos": 13, "qvel": 12, "joint_target": 6, "joint_force": 6, "joint_power": 6, "foot_force": 2}
-    sizes |= {"push_w": 3, "phase": 2, "command": 3, "reference_heading": 0, "reward": 0, "fallen": 0}
+    sizes = {"qpos": 13, "qvel": 12, "joint_target": 6, "joint_force": 6, "joint_power": 6}
+    sizes |= {
+        "joint_net_power": 6,
+        "foot_force": 2,
+        "push_w": 3,
+        "phase": 2,
+        "command": 3,
+        "reference_heading": 0,
+        "reward": 0,
+        "reward_terms": len(REWARDS),
+        "fallen": 0,
+    }
     arrays = {}
     for name, size in sizes.items():
         array = np.zeros((steps, worlds, size) if size else (steps, worlds), dtype=bool if name == "fallen" else np.float32)
@@ -46,7 +57,6 @@ def velocity(forward: float, left: float = 0.0) -> NDArray[np.floating]:
 def test_cost_of_transport_is_power_per_weight_and_speed() -> None:
     power, moving = np.full((50, 3), 91.0), np.tile([0.7, 0.0], (50, 3, 1))
     assert cost_of_transport(power, moving, 130.0) == pytest.approx(1.0)  # 91 W / (130 N 0.7 m/s)
-    assert cost_of_transport_article(power, moving, 130.0) == pytest.approx(1.0 + 1.0 / 130.0)
     assert cost_of_transport(power, 0.0 * moving, 130.0) == math.inf
 
 
@@ -57,29 +67,15 @@ def test_cost_of_transport_sums_the_joints_and_ignores_the_swaying() -> None:
     summary = summarise(walk(qvel=qvel, joint_power=[10.0, 20.0, 5.0, 10.0, 15.0, 5.0]), skip=1.0)
     assert summary.cost_of_transport == pytest.approx(65.0 / (130.0 * 0.5))
     assert summary.cost_of_transport_article == pytest.approx(1.0 + 1.0 / 130.0)
+    assert summary.joint_cost_of_transport == pytest.approx([power / 65.0 for power in (10, 20, 5, 10, 15, 5)])
 
 
-def feet(period: float, steps: int = 500) -> NDArray[np.floating]:
-    """Return ground forces of two feet that carry the robot in turn, (steps, 1, 2)."""
-    swing = np.sin(2.0 * np.pi * STEP_DT * np.arange(steps) / period)
-    return 65.0 * np.stack([1.0 + swing, 1.0 - swing], axis=-1)[:, None]
-
-
-@pytest.mark.parametrize("period", [0.5, 0.6, 0.75])
-def test_gait_period_is_one_stride(period: float) -> None:
-    assert gait_period(feet(period), STEP_DT) == pytest.approx(period, abs=1e-3)
-
-
-@pytest.mark.parametrize("period", [0.48, 0.6])
-def test_gait_period_of_feet_that_are_on_or_off(period: float) -> None:
-    right = (np.arange(500) * STEP_DT % period < 0.5 * period - 1e-9)[:, None]
-    assert gait_period(130.0 * np.stack([right, ~right], axis=-1), STEP_DT) == pytest.approx(period, abs=1e-3)
-
-
-def test_gait_period_needs_a_rhythm_and_two_periods() -> None:
-    assert math.isnan(gait_period(np.full((500, 2, 2), 65.0), STEP_DT))
-    assert math.isnan(gait_period(np.random.default_rng(0).normal(65.0, 30.0, (500, 2, 2)), STEP_DT))
-    assert math.isnan(gait_period(feet(0.5, steps=40), STEP_DT))  # 0.8 s
+def test_positive_work_leaves_out_what_an_actuator_brakes() -> None:
+    # 30 W up and 10 W down: |P| = 40 W and P = 20 W, each on average.
+    power, net = np.array([40.0, 0, 0, 0, 0, 0]), np.array([20.0, 0, 0, 0, 0, 0])
+    summary = summarise(walk(qvel=velocity(0.5), joint_power=power, joint_net_power=net), skip=0.0)
+    assert summary.cost_of_transport == pytest.approx(40.0 / 65.0)
+    assert summary.cost_of_transport_positive == pytest.approx(30.0 / 65.0)
 
 
 def test_heading_velocity_of_a_robot_that_faces_left() -> None:
@@ -98,6 +94,8 @@ def test_speed_error_and_spread() -> None:
     assert summary.command == pytest.approx((0.7, 0.0, 0.0), abs=1e-5)
     assert summary.speed == pytest.approx((0.7, 0.0), abs=1e-5)
     assert summary.speed_spread == pytest.approx(0.1, abs=1e-5)
+    assert summary.speed_ci95 == pytest.approx(1.96 * math.sqrt(2) * 0.1 / math.sqrt(2), abs=1e-5)  # sample deviation, 2 worlds
+    assert summary.lin_vel_rms_error == pytest.approx(0.1, abs=1e-5)
     assert summary.lin_vel_error == pytest.approx(0.1, abs=1e-5)
     assert summary.yaw_rate == pytest.approx(0.03, abs=1e-5)
 
@@ -120,7 +118,8 @@ def test_yaw_drift_wraps(heading: float, reference: float, drift: float) -> None
 def test_falls_count_from_the_start() -> None:
     fallen = np.zeros((200, 2), dtype=bool)
     fallen[3, 0] = fallen[100, 0] = fallen[100, 1] = True
-    assert summarise(walk(fallen=fallen), skip=1.0).falls == 3
+    summary = summarise(walk(fallen=fallen), skip=1.0)
+    assert (summary.falls, summary.worlds_fallen) == (3, 2)
 
 
 def test_a_rollout_of_real_worlds(make_env: Callable[..., TelebipEnv]) -> None:
@@ -130,10 +129,21 @@ def test_a_rollout_of_real_worlds(make_env: Callable[..., TelebipEnv]) -> None:
     assert finished == list(range(1, 16))
     np.testing.assert_allclose(rollout.time, np.linspace(0.02, 0.30, 15))
     assert (rollout.step_dt, rollout.weight) == (pytest.approx(0.02), pytest.approx(13.6 * 9.81))
-    shapes = {"qpos": (13,), "qvel": (12,), "joint_target": (6,), "joint_force": (6,), "joint_power": (6,), "foot_force": (2,)}
-    shapes |= {"push_w": (3,), "phase": (2,), "command": (3,), "reference_heading": (), "reward": (), "fallen": ()}
+    shapes = {"qpos": (13,), "qvel": (12,), "joint_target": (6,), "joint_force": (6,), "joint_power": (6,)}
+    shapes |= {
+        "joint_net_power": (6,),
+        "foot_force": (2,),
+        "push_w": (3,),
+        "phase": (2,),
+        "command": (3,),
+        "reference_heading": (),
+        "reward": (),
+        "reward_terms": (len(REWARDS),),
+        "fallen": (),
+    }
     for name, shape in shapes.items():
         assert getattr(rollout, name).shape == (15, 4, *shape), name
+    np.testing.assert_allclose(rollout.reward_terms.sum(-1), rollout.reward, atol=1e-6)
     assert not rollout.fallen.any()  # time-outs are no falls
     np.testing.assert_array_equal(rollout.qpos[-1], env.sim.state.qpos.numpy())
     assert np.ptp(rollout.qpos[:, :, 9], axis=0).min() > 0.0  # rows are copies, not one live buffer

@@ -9,6 +9,7 @@ from telebip.mdp.gait import foot_sample, phase_signals, push_sample, window_len
 from telebip.mdp.rewards import periodic_foot_force
 
 PERIOD, STEP_DT, WEIGHT = 0.5, 0.02, 133.416
+UNCAPPED = 100.0  # body weights
 HALF = math.sqrt(0.5)
 
 
@@ -19,7 +20,7 @@ def walked_window(first_foot: int) -> torch.Tensor:
         phase = phase_signals(torch.tensor([step * STEP_DT]), PERIOD)
         force = torch.zeros(1, 2)
         force[0, first_foot if phase[0, 0] > 0.0 else 1 - first_foot] = WEIGHT
-        window = push_sample(window, foot_sample(phase, force, WEIGHT))
+        window = push_sample(window, foot_sample(phase, force, WEIGHT, UNCAPPED))
     return window
 
 
@@ -60,13 +61,21 @@ def test_weights_sum_to_the_geometric_series(first: str, gamma: float, total: fl
 def test_foot_sample_weighs_forces_by_phase_in_body_weights() -> None:
     phase = torch.tensor([[0.5, -0.5], [0.5, -0.5], [1.0, -1.0]])
     force = torch.tensor([[200.0, 0.0], [0.0, 200.0], [60.0, 60.0]])
-    torch.testing.assert_close(foot_sample(phase, force, 100.0), torch.tensor([1.0, -1.0, 0.0]))
+    torch.testing.assert_close(foot_sample(phase, force, 100.0, UNCAPPED), torch.tensor([1.0, -1.0, 0.0]))
+
+
+def test_capped_forces_do_not_pay_for_pounding() -> None:
+    phase = torch.tensor([[0.5, -0.5]]).expand(3, -1)
+    force = torch.tensor([[10.0, 0.0], [30.0, 0.0], [350.0, 10.0]])
+    torch.testing.assert_close(foot_sample(phase, force, 100.0, 0.2), torch.tensor([0.05, 0.1, 0.05]))
 
 
 def test_mirroring_the_world_leaves_the_foot_sample_unchanged() -> None:
     generator = torch.Generator().manual_seed(0)
     phase, force = torch.randn(16, 2, generator=generator), 200.0 * torch.rand(16, 2, generator=generator)
-    torch.testing.assert_close(foot_sample(phase.flip(1), force.flip(1), WEIGHT), foot_sample(phase, force, WEIGHT))
+    torch.testing.assert_close(
+        foot_sample(phase.flip(1), force.flip(1), WEIGHT, UNCAPPED), foot_sample(phase, force, WEIGHT, UNCAPPED)
+    )
 
 
 def test_new_sample_enters_in_front_and_the_oldest_leaves() -> None:
@@ -91,5 +100,5 @@ def test_perfect_stepping_without_discount_sums_the_sine_over_a_period() -> None
 
 def test_standing_on_both_feet_earns_nothing() -> None:
     time = torch.arange(26) * STEP_DT
-    samples = foot_sample(phase_signals(time, PERIOD), torch.full((26, 2), WEIGHT / 2), WEIGHT)
+    samples = foot_sample(phase_signals(time, PERIOD), torch.full((26, 2), WEIGHT / 2), WEIGHT, UNCAPPED)
     torch.testing.assert_close(samples, torch.zeros(26))

@@ -50,6 +50,7 @@ def test_observation_is_laid_out_in_this_order() -> None:
         foot_force=row(100, 101),
         joint_force=row(102, 103, 104, 105, 106, 107),
         joint_power=row(108, 109, 110, 111, 112, 113),
+        joint_net_power=row(114, 115, 116, 117, 118, 119),
     )
     obs = observation(
         state,

@@ -9,6 +9,7 @@ import torch
 from telebip.config import (
     CmdRewardConfig,
     DiffRewardConfig,
+    EnergyRewardConfig,
     FootRewardConfig,
     RewardConfig,
     TerminationRewardConfig,
@@ -91,16 +92,18 @@ CFG = RewardConfig(
     cmd=CmdRewardConfig(k_xy=0.2, sigma_xy=0.3, k_w=0.15, sigma_w=0.2),
     diff=DiffRewardConfig(k_diff=-0.02),
     tq=TqRewardConfig(k_tq=-0.05),
-    foot=FootRewardConfig(k_foot=0.1, gamma=0.5, first="newest"),
+    foot=FootRewardConfig(k_foot=0.1, gamma=0.5, first="newest", cap=100.0),
+    energy=EnergyRewardConfig(k_energy=-0.3, ramp=(0.0, 0.0)),
     termination=TerminationRewardConfig(k_termination=-1.0),
 )
 
 
 def one_step() -> StepContext:
-    """0.3 m/s too slow, 0.2 rad/s off, an action 2 away from the last, a saturated knee, and a fall."""
+    """0.3 m/s too slow, 0.2 rad/s off, an action 2 away from the last, a saturated knee, 40 W, and a fall."""
     state = SimState.zeros(1, torch.device("cpu"))
     state.qvel[0, 5] = 0.2
     state.joint_force[0, 2] = 400.0
+    state.joint_power[0] = torch.tensor([1.0, 2.0, 27.0, 0.0, 0.0, 10.0])
     return StepContext(
         state=state,
         base_lin_vel_b=torch.tensor([[0.4, 0.0, 0.0]]),
@@ -108,15 +111,18 @@ def one_step() -> StepContext:
         action=torch.tensor([[0.0, 0.0, 1.0, 0.0, 0.0, 0.0]]),
         last_action=torch.tensor([[0.0, 0.0, -1.0, 0.0, 0.0, 0.0]]),
         force_limit=FORCE_LIMIT,
+        weight=100.0,
         foot_window=torch.tensor([[1.0, 2.0]]),
         foot_weights=torch.tensor([1.0, 0.5]),
+        energy_share=torch.tensor(0.5),
         fallen=torch.tensor([True]),
     )
 
 
-def test_table_gives_the_five_modules_of_the_article() -> None:
+def test_table_gives_the_modules_of_the_article_and_half_of_the_energy_term() -> None:
     values = {name: term(one_step(), CFG).item() for name, term in REWARDS.items()}
-    assert values == pytest.approx({"cmd": 0.35 / math.e, "diff": -0.04, "tq": -0.05, "foot": 0.2, "termination": -1.0})
+    article = {"cmd": 0.35 / math.e, "diff": -0.04, "tq": -0.05, "foot": 0.2, "termination": -1.0}
+    assert values == pytest.approx(article | {"energy": 0.5 * -0.3 * 0.4})
 
 
 def test_table_has_one_row_per_section_of_the_configuration() -> None:
@@ -128,7 +134,7 @@ def test_terms_do_not_change_what_they_are_given(name: str) -> None:
     context, untouched = one_step(), one_step()
     REWARDS[name](context, CFG)
     for field in dataclasses.fields(StepContext):
-        if field.name != "state":
-            assert torch.equal(getattr(context, field.name), getattr(untouched, field.name))
+        if isinstance(value := getattr(context, field.name), torch.Tensor):
+            assert torch.equal(value, getattr(untouched, field.name))
     for field in dataclasses.fields(SimState):
         assert torch.equal(getattr(context.state, field.name), getattr(untouched.state, field.name))

@@ -23,7 +23,7 @@ def test_fallen_is_hips_below_the_height_alone() -> None:
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("part", ["qpos", "qvel", "foot_force", "joint_force", "joint_power"])
+@pytest.mark.parametrize("part", ["qpos", "qvel", "foot_force", "joint_force", "joint_power", "joint_net_power"])
 def test_non_finite_flags_exactly_the_bad_worlds(part: str, value: float) -> None:
     state = standing(5)
     buffer = getattr(state, part)
@@ -40,7 +40,7 @@ def test_infinities_of_both_signs_do_not_cancel() -> None:
 
 def test_ordinary_states_are_finite() -> None:
     state = standing(64)
-    for part in (state.qpos, state.qvel, state.foot_force, state.joint_force, state.joint_power):
+    for part in (state.qpos, state.qvel, state.foot_force, state.joint_force, state.joint_power, state.joint_net_power):
         part.normal_(0.0, 1e6, generator=torch.Generator().manual_seed(0))
     assert not non_finite(state).any()
 

@@ -10,9 +10,10 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from telebip.config import load_task
 from telebip.env import TelebipEnv
 from telebip.errors import UserError
+from telebip.mdp.rewards import REWARDS
 from telebip.rl.checkpoint import load_checkpoint
 from telebip.rl.policy import load_policy
-from telebip.rl.train import EpisodeStatistics, Trainer
+from telebip.rl.train import EpisodeStatistics, Trainer, min_std
 from telebip.robot import Robot
 
 SMALL = ("num_envs=8", "ppo.num_steps_per_env=10", "ppo.hidden_dims=[16,16]", "episode.length=0.2")
@@ -42,7 +43,7 @@ def test_a_run_leaves_checkpoints_and_curves_and_goes_on(robot: Robot, tmp_path:
     assert {path.name for path in tmp_path.glob("*.pt")} == {"model_2.pt", "policy.pt"}
     curves = scalars(tmp_path)
     assert set(curves) >= {
-        *(f"reward/{name}" for name in ("cmd", "diff", "tq", "foot", "termination")),
+        *(f"reward/{name}" for name in REWARDS),
         *("error/lin_vel_mps", "error/yaw_rate_radps", "walk/cost_of_transport", "walk/falls_per_minute"),
         *("fault/non_finite_worlds", "train/episode_return", "train/episode_length", "train/action_std"),
         *("train/learning_rate", "loss/value", "loss/surrogate", "speed/samples_per_s"),
@@ -88,6 +89,18 @@ def test_the_same_seed_gives_the_same_weights_bit_for_bit(robot: Robot, tmp_path
     a, b, c = (train(robot, tmp_path / name, 2, seed).learner.get_policy().state_dict() for name, seed in runs)
     assert all(torch.equal(a[name], b[name]) for name in a)
     assert not all(torch.equal(a[name], c[name]) for name in a)
+
+
+def test_the_floor_of_the_exploration_noise_falls_geometrically_between_its_ends() -> None:
+    cfg = load_task("telebip_flat", ["ppo.min_std=0.16", "ppo.final_min_std=0.04", "ppo.min_std_ramp=[100,300]"]).ppo
+    assert [min_std(cfg, samples) for samples in (0, 100, 200, 300, 10**9)] == pytest.approx([0.16, 0.16, 0.08, 0.04, 0.04])
+
+
+def test_the_exploration_noise_keeps_to_its_floor(robot: Robot, tmp_path: Path) -> None:
+    floor = ("ppo.init_std=0.1", "ppo.min_std=0.3", "ppo.final_min_std=0.2", "ppo.min_std_ramp=[80,160]")
+    seen: list[float] = []
+    trainer(robot, tmp_path, 3, *floor).learn(lambda: False, lambda scalars: seen.append(scalars["train/action_std"]))
+    assert seen == pytest.approx([0.3, 0.3, 0.2])
 
 
 def test_stopping_saves_what_was_learned(robot: Robot, tmp_path: Path) -> None:

@@ -20,8 +20,15 @@ Arrays = Mapping[str, NDArray[np.floating]]
 Make = Callable[..., Simulator]
 
 NUM_ENVS, DECIMATION, STEPS = 8, 4, 25
-FIELDS = ("qpos", "qvel", "foot_force", "joint_force", "joint_power")
-TOLERANCE = {"qpos": 2e-5, "qvel": 2e-4, "foot_force": 2e-2, "joint_force": 2.5e-2, "joint_power": 1e-2}
+FIELDS = ("qpos", "qvel", "foot_force", "joint_force", "joint_power", "joint_net_power")
+TOLERANCE = {
+    "qpos": 2e-5,
+    "qvel": 2e-4,
+    "foot_force": 2e-2,
+    "joint_force": 2.5e-2,
+    "joint_power": 1e-2,
+    "joint_net_power": 1e-2,
+}
 """Of `warp` [m, rad | m/s, rad/s | N | N, N m | W]: twenty times the largest difference seen over 25 policy steps."""
 
 BACKENDS = [
@@ -79,8 +86,8 @@ def mj_rollout(
                 mujoco.mj_step(model, data)
                 feet.append(data.sensordata[list(robot.foot_sensor_adr)])
                 forces.append(data.actuator_force.copy())
-                powers.append(np.abs(data.actuator_force * data.actuator_velocity))
-            values = (data.qpos.copy(), data.qvel.copy(), *(np.mean(v, axis=0) for v in (feet, forces, powers)))
+                powers.append(data.actuator_force * data.actuator_velocity)
+            values = (data.qpos.copy(), data.qvel.copy(), *(np.mean(v, axis=0) for v in (feet, forces, np.abs(powers), powers)))
             for name, value in zip(FIELDS, values, strict=True):
                 rows[name].append(value)
         for name in FIELDS:
@@ -157,7 +164,7 @@ def test_reset_changes_masked_worlds_only(make: Make, robot: Robot) -> None:
         np.testing.assert_array_equal(after[name][kept], before[name][kept])
     np.testing.assert_array_equal(after["qpos"][[2, 5]], qpos[[2, 5]])
     np.testing.assert_array_equal(after["qvel"][[2, 5]], qvel[[2, 5]])
-    for name in ("foot_force", "joint_force", "joint_power"):
+    for name in ("foot_force", "joint_force", "joint_power", "joint_net_power"):
         assert not after[name][[2, 5]].any()
 
 

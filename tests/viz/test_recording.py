@@ -1,115 +1,139 @@
-# pyright: reportAttributeAccessIssue=false
 """A recording, read back with rerun's own reader, shows what happened."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 import pytest
-import torch
-import yourdfpy
 from numpy.typing import NDArray
 
-from telebip.control.policy import Stateless
-from telebip.env import TelebipEnv
 from telebip.errors import UserError
-from telebip.eval.rollout import Rollout, roll_out
-from telebip.robot import FEET, JOINTS, Robot
-from telebip.viz.rerun import foot_positions, record
+from telebip.eval.rollout import Rollout
+from telebip.mdp.rewards import REWARDS
+from telebip.robot import FEET, JOINTS
+from telebip.viz.rerun import PUSH_SCALE, SPEED_SCALE, record, show
+from telebip.viz.scene import LANE, line_up
 
 chunk = pytest.importorskip("rerun.chunk")
 
-STEPS = 50  # 1 s
-TRUNK = "/world/robot/trunk"
+STEPS = 100
+TRUNK = "/world/RL_2/trunk"
 KNEE = f"{TRUNK}/right_hip/right_thigh/right_shank"
+FORCE = "/world/RL_2/ground_force/left_foot"
+ARROW, SCALAR, MOVED, TURNED = "Arrows3D:vectors", "Scalars:scalars", "Transform3D:translation", "Transform3D:mat3x3"
 
 Columns = dict[str, dict[str, list[Any]]]
 
 
 @pytest.fixture(scope="module")
-def rollout(make_env: Callable[..., TelebipEnv]) -> Rollout:
-    return roll_out(make_env(num_envs=2), Stateless(lambda obs: torch.zeros(2, 6)), STEPS)
-
-
-@pytest.fixture(scope="module")
-def urdf(robot: Robot) -> Path:
-    return robot.path.with_suffix(".urdf")
-
-
-@pytest.fixture(scope="module")
-def recorded(rollout: Rollout, urdf: Path, tmp_path_factory: pytest.TempPathFactory) -> Columns:
-    """Columns of every entity that changes with time, as the reader gives them."""
+def file(walking: Rollout, standing: Rollout, urdf: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two of the walking worlds and the standing one in one recording."""
     file = tmp_path_factory.mktemp("recording") / "new_folder" / "walk.rrd"
-    record(rollout, urdf, file, world=1)
-    chunks = list(chunk.RrdReader(file).stream())
-    columns: Columns = {part.entity_path: {} for part in chunks}
-    for part in chunks:
-        if not part.is_static:
-            for name, values in part.to_record_batch().to_pydict().items():
-                columns[part.entity_path].setdefault(name, []).extend(values)
+    record(line_up([("RL", walking), ("no policy", standing)], worlds=2), urdf, file)
+    return file
+
+
+@pytest.fixture(scope="module")
+def recorded(file: Path) -> Columns:
+    """Columns of every entity, as the reader gives them."""
+    columns: Columns = {}
+    for part in chunk.RrdReader(file).stream():
+        entity = columns.setdefault(part.entity_path, {})
+        for name, values in part.to_record_batch().to_pydict().items():
+            entity.setdefault(name, []).extend(values)
     return columns
 
 
 def column(recorded: Columns, entity: str, component: str) -> NDArray[np.float64]:
     """One row per step; a batch of one instance is taken out of its list."""
-    return np.array([values[0] for values in recorded[entity][component]], dtype=float)
+    rows = [values[0] for values in recorded[entity][component] if values is not None]
+    return np.array(rows, dtype=float)
 
 
-def test_every_link_and_series_is_there(recorded: Columns) -> None:
-    leg = ("hip", "hip/{}_thigh", "hip/{}_thigh/{}_shank", "hip/{}_thigh/{}_shank/{}_foot")
-    links = {f"{TRUNK}/{side}_{part.format(*[side] * 3)}" for side in ("right", "left") for part in leg}
-    forces = {f"/world/ground_force/{foot}" for foot in FEET} | {"/world/push"}
-    joints = {f"/plot/joint_{what}/{joint}" for what in ("pos", "target", "force") for joint in JOINTS}
-    series = {f"/plot/{name}" for name in ("speed/command", "speed/forward", "phase/p_r", "phase/p_l", "power/total")}
-    series |= {f"/plot/foot_force/{foot}" for foot in FEET} | {"/plot/reward/total"}
-    assert {TRUNK, *links, *forces, *joints, *series} <= set(recorded)
-    assert all(len(recorded[entity]["time"]) == STEPS for entity in {TRUNK, *links, *forces, *joints, *series})
+@pytest.mark.parametrize(("name", "steps"), [("RL_1", 100), ("RL_2", 100), ("no_policy", 20)])
+def test_every_robot_has_its_links_forces_and_series(recorded: Columns, name: str, steps: int) -> None:
+    leg = ("hip", "hip/{0}_thigh", "hip/{0}_thigh/{0}_shank", "hip/{0}_thigh/{0}_shank/{0}_foot")
+    links = {f"trunk/{side}_{part.format(side)}" for side in ("right", "left") for part in leg}
+    arrows = {*(f"ground_force/{foot}" for foot in FEET), "push", "velocity/command", "velocity/actual"}
+    sides = ("right", "left", "right_target", "left_target")
+    series = {f"{joint}/{side}" for joint in ("hip_roll", "hip_pitch", "knee") for side in sides}
+    series |= {"speed/command", "speed/forward", "yaw_rate/command", "yaw_rate/trunk", "gait/p_r", "gait/p_l"}
+    series |= {"power/total", "cost_of_transport/mechanical", "reward/total", "knee_force/right", "knee_force/left"}
+    series |= {f"reward/{term}" for term in REWARDS} | {f"gait/{foot}" for foot in FEET}
+    series |= {f"torque/{joint}" for joint in JOINTS if not joint.endswith("knee")}
+    for entity in [f"/world/{name}/{path}" for path in links | arrows] + [f"/plot/{name}/{path}" for path in series]:
+        times = [time for time in recorded[entity]["time"] if time is not None]
+        assert len(times) == steps, entity
 
 
 def test_the_time_runs_from_the_first_step_to_the_last(recorded: Columns) -> None:
-    times = [time.total_seconds() for time in recorded[TRUNK]["time"]]
+    times = [time.total_seconds() for time in recorded[TRUNK]["time"] if time is not None]
     np.testing.assert_allclose(times, 0.02 * np.arange(1, STEPS + 1), atol=1e-6)
 
 
-def test_the_trunk_moves_as_it_did(recorded: Columns, rollout: Rollout) -> None:
-    np.testing.assert_allclose(column(recorded, TRUNK, "Transform3D:translation"), rollout.qpos[:, 1, :3], atol=1e-6)
+def test_the_trunk_moves_as_it_did(recorded: Columns, walking: Rollout) -> None:
+    np.testing.assert_allclose(column(recorded, TRUNK, MOVED), walking.qpos[:, 1, :3], atol=1e-6)
     quat_xyzw = column(recorded, TRUNK, "Transform3D:quaternion")
-    np.testing.assert_allclose(quat_xyzw[:, [3, 0, 1, 2]], rollout.qpos[:, 1, 3:7], atol=1e-6)
-    assert np.ptp(rollout.qpos[:, 1, 2]) > 0.001
+    np.testing.assert_allclose(quat_xyzw[:, [3, 0, 1, 2]], walking.qpos[:, 1, 3:7], atol=1e-6)
+    assert walking.qpos[-1, 1, 0] > 0.8  # m walked
 
 
-def test_the_knee_slides_along_the_leg(recorded: Columns, rollout: Rollout) -> None:
-    slide = column(recorded, KNEE, "Transform3D:translation")
-    knee = rollout.qpos[:, 1, 7 + JOINTS.index("right_knee")]
-    np.testing.assert_allclose(slide[[0, -1]], [[0.0, 0.0, -0.67 + knee[0]], [0.0, 0.0, -0.67 + knee[-1]]], atol=1e-6)
-    np.testing.assert_allclose(column(recorded, "/plot/joint_pos/right_knee", "Scalars:scalars"), knee, atol=1e-6)
+def test_the_knee_slides_along_the_leg(recorded: Columns, walking: Rollout) -> None:
+    slide = column(recorded, KNEE, MOVED)
+    knee = walking.qpos[:, 1, 7 + JOINTS.index("right_knee")]
+    np.testing.assert_allclose(slide, np.outer(knee - 0.67, [0, 0, 1]), atol=1e-6)
+    np.testing.assert_allclose(column(recorded, "/plot/RL_2/knee/right", SCALAR), knee, atol=1e-6)
+    assert np.ptp(knee) > 0.02
 
 
-def test_a_hip_turns_about_its_axis(recorded: Columns, rollout: Rollout) -> None:
-    pitch = rollout.qpos[:, 1, 7 + JOINTS.index("left_hip_pitch")].astype(float)
-    quat_xyzw = column(recorded, f"{TRUNK}/left_hip/left_thigh", "Transform3D:quaternion")
-    zero = np.zeros(STEPS)
-    np.testing.assert_allclose(quat_xyzw, np.stack([zero, np.sin(pitch / 2), zero, np.cos(pitch / 2)], axis=1), atol=1e-6)
-    assert np.abs(pitch).max() > 0.001
+def test_a_hip_turns_about_its_axis(recorded: Columns, walking: Rollout) -> None:
+    pitch = walking.qpos[:, 1, 7 + JOINTS.index("left_hip_pitch")].astype(float)
+    turned = column(recorded, f"{TRUNK}/left_hip/left_thigh", TURNED).reshape(STEPS, 3, 3).swapaxes(1, 2)  # by columns
+    zero, one, s, c = np.zeros(STEPS), np.ones(STEPS), np.sin(pitch), np.cos(pitch)
+    about_y = np.stack([np.stack([c, zero, s], -1), np.stack([zero, one, zero], -1), np.stack([-s, zero, c], -1)], axis=1)
+    np.testing.assert_allclose(turned, about_y, atol=1e-6)
+    assert np.ptp(pitch) > 0.2
 
 
-def test_feet_stand_where_mujoco_has_them(robot: Robot, urdf: Path) -> None:
-    random = np.random.default_rng(0)
-    qpos = np.concatenate([random.uniform(-2.0, 2.0, (20, 3)), random.normal(size=(20, 4)), np.zeros((20, 6))], axis=1)
-    qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
-    qpos[:, 7:] = random.uniform(robot.joint_range[:, 0], robot.joint_range[:, 1], (20, 6))
-    places = foot_positions(yourdfpy.URDF.load(str(urdf)), qpos)
-    data = mujoco.MjData(robot.model)
-    for step, row in enumerate(qpos):
-        data.qpos[:] = row
-        mujoco.mj_kinematics(robot.model, data)
-        for foot, place in zip(FEET, places, strict=True):
-            np.testing.assert_allclose(place[step], data.site(foot).xpos, atol=1e-6)
+def test_arrows_are_as_long_as_what_they_show(recorded: Columns, walking: Rollout) -> None:
+    load = walking.foot_force[:, 1, 1]
+    np.testing.assert_allclose(column(recorded, FORCE, ARROW), np.outer(load, [0, 0, 0.001]), atol=1e-6)
+    push = column(recorded, "/world/RL_2/push", ARROW)
+    np.testing.assert_allclose(push, PUSH_SCALE * walking.push_w[:, 1], atol=1e-6)
+    assert np.abs(push).max() > 0.0
+    actual = column(recorded, "/world/RL_2/velocity/actual", ARROW) / SPEED_SCALE
+    np.testing.assert_allclose(actual[:, :2], walking.qvel[:, 1, :2], atol=1e-6)
+    wanted = np.linalg.norm(column(recorded, "/world/RL_2/velocity/command", ARROW), axis=1)
+    np.testing.assert_allclose(wanted, SPEED_SCALE * 0.7, rtol=1e-5)
 
 
-def test_a_place_that_cannot_be_written_is_one_line(rollout: Rollout, urdf: Path, tmp_path: Path) -> None:
+def test_robots_stand_side_by_side(recorded: Columns) -> None:
+    lanes = [column(recorded, f"/world/{name}", MOVED)[0, 1] for name in ("RL_1", "RL_2", "no_policy")]
+    np.testing.assert_allclose(lanes, [LANE, 0.0, -LANE], atol=1e-6)
+
+
+def test_the_layout_comes_with_the_recording(file: Path) -> None:
+    assert len(chunk.RrdReader(file).blueprints()) == 1
+
+
+def test_two_seconds_of_one_robot_are_small(walking: Rollout, urdf: Path, tmp_path: Path) -> None:
+    record(line_up([("RL", walking)]), urdf, tmp_path / "one.rrd")
+    assert 50_000 < (tmp_path / "one.rrd").stat().st_size < 1_000_000
+
+
+def test_a_place_that_cannot_be_written_is_one_line(walking: Rollout, urdf: Path, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(UserError, match=r"^cannot write recording '.*walk.rrd': [^\n]+$"):
-        record(rollout, urdf, tmp_path / "file" / "walk.rrd")
+        record(line_up([("RL", walking)]), urdf, tmp_path / "file" / "walk.rrd")
+
+
+def test_a_viewer_that_is_not_there_is_one_line(walking: Rollout, urdf: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(UserError, match=r"^no rerun viewer answers at '127.0.0.1:1': [^\n]+$"):
+        show(line_up([("RL", walking)]), urdf, "127.0.0.1:1")
+    with pytest.raises(UserError, match="is no address of a rerun viewer"):
+        show(line_up([("RL", walking)]), urdf, "here:there")
+    for variable in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setattr("sys.platform", "linux")
+    with pytest.raises(UserError, match="needs a display; use --record"):
+        show(line_up([("RL", walking)]), urdf)

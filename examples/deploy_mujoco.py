@@ -1,0 +1,173 @@
+# pyright: reportAttributeAccessIssue=false, reportIndexIssue=false
+"""Walk an exported policy in plain MuJoCo with numpy, onnxruntime and mujoco alone: no telebip, no torch.
+
+    python scripts/export.py --checkpoint assets/policies/telebip_flat --out policy.onnx
+    python examples/deploy_mujoco.py policy.onnx assets/telebip.xml --command 0.7 0 0
+
+`Policy` is what runs on a robot's computer: it takes sensor readings and returns joint targets, and all it knows comes from the
+ONNX file. `SimulatedRobot` is what a robot's drivers would replace: encoders, an inertial measurement unit, an estimate of the
+velocity, and position controllers with the gains of the file.
+"""
+
+import argparse
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import onnxruntime
+
+
+@dataclass(frozen=True)
+class Readings:
+    """What the sensors say now. Joints in the order of the file's `joint_names`; x forward, y left, z up."""
+
+    joint_pos: np.ndarray  # rad or m
+    joint_vel: np.ndarray  # rad/s or m/s
+    lin_vel: np.ndarray  # of the trunk's frame (midway between the hips), in that frame [m/s]
+    ang_vel: np.ndarray  # of the trunk, in its frame [rad/s]
+    quat: np.ndarray  # orientation of the trunk, w x y z
+
+
+class Policy:
+    """An exported policy with the little state that its observation needs: time, last action, reference heading."""
+
+    def __init__(self, file: Path) -> None:
+        """Load the network and its description."""
+        self._session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
+        texts = self._session.get_modelmeta().custom_metadata_map
+        self.about = {key: json.loads(text) for key, text in texts.items()}
+        self._nominal, self._scale = np.array(self.about["nominal_pose"]), np.array(self.about["action_scale"])
+        self._parts = [(part["name"], part["size"], part["scale"]) for part in self.about["observation"]]
+
+    def start(self, readings: Readings) -> None:
+        """Begin to walk: forget the past and take the present heading as reference."""
+        self._steps = 0
+        self._last_action = np.zeros(len(self._nominal))
+        self._reference_heading = yaw(readings.quat)
+
+    def joint_targets(self, readings: Readings, command: np.ndarray) -> np.ndarray:
+        """Return joint targets [rad | m] for the next `step_dt`; call once per `step_dt`.
+
+        Args:
+            readings: the sensors, now.
+            command: (vx forward, vy left, yaw rate) [m/s, m/s, rad/s].
+        """
+        about = self.about
+        if self._steps > 0:
+            self._reference_heading += about["step_dt"] * command[2]
+        error = (self._reference_heading - yaw(readings.quat) + np.pi) % (2.0 * np.pi) - np.pi
+        correction = np.clip(about["heading_gain"] * error, -about["heading_limit"], about["heading_limit"])
+        phase = np.sin(2.0 * np.pi * self._steps * about["step_dt"] / about["gait_period"])
+        seen = {
+            "joint_pos": readings.joint_pos - self._nominal,
+            "joint_vel": readings.joint_vel,
+            "last_action": self._last_action,
+            "base_lin_vel": readings.lin_vel,
+            "base_ang_vel": readings.ang_vel,
+            "base_quat": relative_to_heading(readings.quat, self._reference_heading),
+            "command": np.array([command[0], command[1], command[2] + correction]),
+            "phase": np.array([phase, -phase]),
+        }
+        obs = np.concatenate([scale * seen[name] for name, _, scale in self._parts]).astype(np.float32)
+        self._last_action = self._session.run(["actions"], {"obs": obs[None]})[0][0]
+        self._steps += 1
+        return self._nominal + self._scale * self._last_action
+
+
+class SimulatedRobot:
+    """The robot's sensors and motors, in MuJoCo."""
+
+    def __init__(self, file: Path, about: dict) -> None:
+        """Stand in the pose `home`, with the gains that the policy was trained with."""
+        self.model = mujoco.MjModel.from_xml_path(str(file))
+        self.data = mujoco.MjData(self.model)
+        self.model.opt.timestep = about["physics_dt"]
+        self._joints = about["joint_names"]
+        self._motors = [self.model.actuator(name).id for name in self._joints]
+        self._substeps = round(about["step_dt"] / about["physics_dt"])
+        self._imu = self.model.site("imu").pos.copy()  # where the inertial measurement unit sits in the trunk's frame [m]
+        for motor, kp, kd, limit in zip(self._motors, about["stiffness"], about["damping"], about["force_limit"], strict=True):
+            self.model.actuator_gainprm[motor, 0] = kp
+            self.model.actuator_biasprm[motor, 1:3] = -kp, -kd
+            self.model.actuator_forcerange[motor] = -limit, limit
+        mujoco.mj_resetDataKeyframe(self.model, self.data, self.model.key("home").id)
+        mujoco.mj_forward(self.model, self.data)
+
+    def read(self) -> Readings:
+        """Read the named sensors."""
+
+        def sensor(name: str) -> np.ndarray:
+            return self.data.sensor(name).data.copy()
+
+        ang_vel = sensor("gyro")
+        return Readings(
+            joint_pos=np.concatenate([sensor(f"{joint}_pos") for joint in self._joints]),
+            joint_vel=np.concatenate([sensor(f"{joint}_vel") for joint in self._joints]),
+            lin_vel=sensor("velocimeter") - np.cross(ang_vel, self._imu),  # from the unit down to between the hips
+            ang_vel=ang_vel,
+            quat=sensor("orientation"),
+        )
+
+    def move(self, joint_targets: np.ndarray) -> None:
+        """Hold the targets for one policy step."""
+        self.data.ctrl[self._motors] = joint_targets
+        for _ in range(self._substeps):
+            mujoco.mj_step(self.model, self.data)
+        mujoco.mj_forward(self.model, self.data)  # sensors of the state after the step, not of the one before it
+
+
+def walk(
+    policy: Policy, robot: SimulatedRobot, command: np.ndarray, duration: float, show: Callable[[float], None] = lambda t: None
+) -> np.ndarray:
+    """Walk for `duration` [s] and return the trajectory qpos, (steps, 13), one row after each policy step."""
+    steps = round(duration / policy.about["step_dt"])
+    trajectory = np.zeros((steps, robot.model.nq))
+    policy.start(robot.read())
+    for step in range(steps):
+        robot.move(policy.joint_targets(robot.read(), command))
+        trajectory[step] = robot.data.qpos
+        show((step + 1) * policy.about["step_dt"])
+    return trajectory
+
+
+def yaw(quat: np.ndarray) -> float:
+    """Return the heading [rad] of the x axis of the orientation w x y z."""
+    w, x, y, z = quat
+    return float(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
+
+
+def relative_to_heading(quat: np.ndarray, heading: float) -> np.ndarray:
+    """Return the orientation as seen from the reference heading [rad], with w >= 0: q_z(-heading) q."""
+    c, s = np.cos(0.5 * heading), np.sin(0.5 * heading)
+    w, x, y, z = quat
+    relative = np.array([c * w + s * z, c * x + s * y, c * y - s * x, c * z - s * w])
+    return -relative if relative[0] < 0.0 else relative
+
+
+def main() -> None:
+    """Walk and print how fast."""
+    parser = argparse.ArgumentParser(description="Walk an exported policy in plain MuJoCo.")
+    parser.add_argument("policy", type=Path, help="ONNX file from scripts/export.py")
+    parser.add_argument("model", type=Path, help="MJCF of the robot, assets/telebip.xml")
+    parser.add_argument("--command", nargs=3, type=float, default=(0.7, 0.0, 0.0), metavar=("VX", "VY", "WZ"))
+    parser.add_argument("--duration", type=float, default=20.0, help="s (default: 20)")
+    options = parser.parse_args()
+
+    policy = Policy(options.policy)
+    robot = SimulatedRobot(options.model, policy.about)
+
+    def show(t: float) -> None:
+        if t % 2.0 < 0.5 * policy.about["step_dt"]:
+            x, y, z = robot.data.qpos[:3]
+            print(f"{t:5.1f} s   x {x:6.2f} m   y {y:6.2f} m   hips {z:.2f} m above ground")
+
+    trajectory = walk(policy, robot, np.array(options.command), options.duration, show)
+    distance = np.linalg.norm(trajectory[-1, :2] - trajectory[0, :2])
+    print(f"{distance:.1f} m in {options.duration:g} s: {distance / options.duration:.2f} m/s")
+
+
+if __name__ == "__main__":
+    main()

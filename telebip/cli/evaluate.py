@@ -1,0 +1,169 @@
+"""`evaluate.py`: measure what walks, and report it."""
+
+import argparse
+from collections.abc import Sequence
+from hashlib import sha256
+from pathlib import Path
+
+from telebip.cli.common import Parser, resolve_device
+from telebip.config import load_task
+from telebip.errors import UserError
+
+EXAMPLES = """\
+  evaluate.py --checkpoint assets/policies/telebip_efficient --out report
+  evaluate.py --checkpoint runs/telebip_flat/2026-01-31_12-00-00 --suite tracking,gait
+  evaluate.py --checkpoint assets/policies/telebip_flat --suite push --max-force 150
+  evaluate.py --controller dcm control.step_time=0.2 sim.decimation=1
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Parse arguments, measure, print, and write the report."""
+    options = _parse(argv)
+    from rich.console import Console
+
+    console = Console(highlight=False, soft_wrap=True)
+    with console.status("loading torch and the physics engine"):
+        from telebip.eval.push import PushProtocol
+        from telebip.eval.report import make_folder, write_report, write_results
+        from telebip.eval.suites import Protocol, check_suites, evaluate
+        from telebip.robot import load_robot
+    suites = check_suites(options.suite.split(","))
+    device = resolve_device(options.device)
+    if options.controller:
+        subject = controller_subject(options.controller, options.label, options.overrides)
+    else:
+        subject = subject_of(options.checkpoint, options.label, options.overrides)
+    push = PushProtocol(max_force=options.max_force, worlds=options.push_worlds)
+    protocol = Protocol(
+        worlds=options.num_envs,
+        duration=options.duration,
+        skip=min(5.0, 0.25 * options.duration),
+        commands=options.commands,
+        push=push,
+        device=device,
+        backend=options.backend,
+    )
+    robot = load_robot(subject.config.sim.robot)
+    out = Path(options.out or f"reports/{subject.label}")
+    make_folder(out)
+    with progress_bar(console) as show:
+        results = evaluate(subject, robot, suites, protocol, show)
+    write_results(results, out)
+    write_report([results], out, f"{subject.label}: how it walks", f"Measured by: {subject.source}", references=references())
+    console.print((out / "report.md").read_text(encoding="utf-8"), markup=False)
+    console.print(f"wrote {out}/results.json, report.md and report.html")
+
+
+def controller_subject(name: str, label: str | None, overrides: Sequence[str] = ()):
+    """Return a model-based walker as a subject of the evaluator, with `overrides` of its parameters and of the task."""
+    from telebip.control.factory import make_controller
+    from telebip.eval.suites import Subject
+
+    own = [override for override in overrides if override.startswith("control.")]
+    task = [override for override in overrides if not override.startswith("control.")]
+    return Subject(
+        label=label or name,
+        config=load_task("telebip_flat", task),
+        make_policy=lambda env: make_controller(name, env, own),
+        limited=False,
+        source=" ".join(["evaluate.py --controller", name, *overrides]),
+        fingerprint=" ".join([name, *overrides]),
+    )
+
+
+def subject_of(checkpoint_path: str, label: str | None, overrides: Sequence[str] = ()):
+    """Return what a checkpoint holds as a subject of the evaluator; the label is the name of its task unless one is given."""
+    from telebip.eval.suites import Subject
+    from telebip.rl.checkpoint import load_checkpoint
+    from telebip.rl.policy import load_policy
+
+    checkpoint = load_checkpoint(checkpoint_path)
+    return Subject(
+        label=label or checkpoint.task,
+        config=load_task(checkpoint.config, overrides),
+        make_policy=lambda env: load_policy(checkpoint, env.device),
+        run_dir=checkpoint.path.parent,
+        source=f"evaluate.py --checkpoint {checkpoint_path}",
+        fingerprint=sha256(checkpoint.path.read_bytes()).hexdigest()[:16],
+    )
+
+
+def references() -> list[dict]:
+    """Return the article's numbers as results."""
+    from telebip.eval.article import TRACKING, as_results
+
+    return [as_results(label) for label in TRACKING]
+
+
+def progress_bar(console):
+    """Return a context whose value shows what is running, how far it is and how long it will take."""
+    from contextlib import contextmanager
+
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    @contextmanager
+    def bar():
+        columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TextColumn("eta"), TimeRemainingColumn())
+        with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+            tasks = {}
+
+            def show(name: str, step: int, total: int) -> None:
+                if name not in tasks:
+                    tasks[name] = progress.add_task(name, total=total)
+                progress.update(tasks[name], completed=step)
+
+            yield show
+
+    return bar()
+
+
+def speeds(text: str) -> tuple[float, ...]:
+    """Read `0.5,0.7`; argparse turns a ValueError into a refusal that quotes the text."""
+    return tuple(float(part) for part in text.split(","))
+
+
+def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = Parser(
+        "Measure how something walks (tracking, energy, pushes, gait, learning) and report it beside the article's numbers.",
+        EXAMPLES,
+    )
+    who = parser.add_mutually_exclusive_group()
+    who.add_argument("--checkpoint", metavar="PATH_OR_RUN", help="a checkpoint file, or a run folder for its newest")
+    who.add_argument("--controller", choices=("alip", "dcm"), help="a model-based walker: angular momentum, or DCM")
+    parser.add_argument(
+        "--suite",
+        default="tracking,push,gait,learning",
+        metavar="A,B",
+        help="which suites (default: tracking,push,gait,learning)",
+    )
+    parser.add_argument(
+        "--out", metavar="DIR", help="folder of results.json, report.md and report.html (default: reports/<label>)"
+    )
+    parser.add_argument("--label", metavar="NAME", help="name in tables and plots (default: the task's)")
+    parser.add_argument("--num-envs", type=int, default=64, metavar="N", help="worlds for each commanded speed (default: 64)")
+    parser.add_argument("--duration", type=float, default=20.0, metavar="S", help="seconds of walking (default: 20)")
+    parser.add_argument(
+        "--commands",
+        type=speeds,
+        metavar="VX,VX",
+        help="forward speeds in m/s (default: 0.5,0.7,1.0,-0.3 as far as the policy was trained on them)",
+    )
+    parser.add_argument("--max-force", type=float, default=300.0, metavar="N", help="largest push tried in N (default: 300)")
+    parser.add_argument("--push-worlds", type=int, default=32, metavar="N", help="worlds for each push (default: 32)")
+    parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto, which prefers CUDA)")
+    parser.add_argument("--backend", default="auto", choices=("auto", "native", "warp"), help="physics engine (default: auto)")
+    parser.add_argument("overrides", nargs="*", metavar="key.path=value", help="override any field of the task")
+    options = parser.parse(argv)
+    if not (options.checkpoint or options.controller):
+        raise UserError("what is to be measured? --checkpoint PATH_OR_RUN (try assets/policies/telebip_flat), or --controller")
+    for name, low, high in (
+        ("num_envs", 1, 2**20),
+        ("duration", 1.0, 3600.0),
+        ("max_force", 5.0, 5000.0),
+        ("push_worlds", 1, 2**16),
+    ):
+        value = getattr(options, name)
+        if not low <= value <= high:
+            raise UserError(f"--{name.replace('_', '-')} must be between {low:g} and {high:g}, got {value:g}")
+    return options

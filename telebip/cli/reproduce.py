@@ -1,0 +1,140 @@
+"""`reproduce.py`: the whole study with one command, which goes on where it was stopped."""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from telebip import ROOT
+from telebip.cli.common import Parser, resolve_device
+from telebip.cli.evaluate import controller_subject, progress_bar, references, subject_of
+from telebip.config import load_task
+from telebip.errors import UserError, nearest
+
+EXAMPLES = """\
+  reproduce.py                                  train and measure what is not yet, and write the report
+  reproduce.py --only telebip_efficient dcm     these alone
+  reproduce.py --shipped                        no training: measure the policies in assets/policies
+  reproduce.py --quick --out /tmp/study         the same at a toy size, in a minute
+"""
+
+QUICK_TRAINING = ("num_envs=64", "ppo.max_iterations=2", "ppo.hidden_dims=[32,32]")
+SHIPPED = ROOT / "assets" / "policies"
+INTRODUCTION = (
+    "Reinforcement learning and two model-based walkers on one robot, measured by one evaluator; in grey, and in the last "
+    "rows, the article's own numbers, which belong to its own robot. Trainings: {trainings}. Every number comes from "
+    "`scripts/reproduce.py`."
+)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Parse arguments, train, measure and report."""
+    options = _parse(argv)
+    from rich.console import Console
+
+    console = Console(highlight=False, soft_wrap=True)
+    with console.status("loading torch and the physics engine"):
+        from telebip.eval.report import make_folder, read_results, write_report
+        from telebip.eval.study import BASELINES, TRAININGS
+    names = [walker.name for walker in (*TRAININGS, *BASELINES)]
+    for name in options.only:
+        if name not in names:
+            raise UserError(f"unknown walker '{name}'; {nearest(name, names)}")
+    out = Path(options.out)
+    make_folder(out)
+    for training in TRAININGS:
+        if not options.only or training.name in options.only:
+            for seed in training.seeds:
+                run_dir = SHIPPED / training.name if options.shipped else _train(console, training, seed, options)
+                if run_dir is None:
+                    return
+                name = training.name if seed == training.seeds[0] else f"{training.name}-seed{seed}"
+                _measure(console, out / name, training, options, lambda r=run_dir, t=training: subject_of(str(r), t.label))
+    for baseline in BASELINES:
+        if not options.only or baseline.name in options.only:
+            subject = lambda b=baseline: controller_subject(b.controller, b.label, b.overrides)  # noqa: E731
+            _measure(console, out / baseline.name, baseline, options, subject)
+    results = {name: read_results(file) for name in names if (file := out / name / "results.json").is_file()}
+    seeds = [f"{t.label} ({len(t.seeds)} seed{'s' if len(t.seeds) > 1 else ''})" for t in TRAININGS if t.name in results]
+    text = INTRODUCTION.format(trainings=", ".join(seeds) or "none")
+    write_report(list(results.values()), out, "The study", text, references())
+    console.print(f"wrote {out}/report.md and report.html, about {len(results)} of {len(names)} walkers")
+
+
+def _train(console, training, seed: int, options: argparse.Namespace) -> Path | None:
+    """Train, or go on training, one policy; return its run folder, or None if the user stopped it."""
+    from telebip.cli.train import progress_bar as training_bar
+    from telebip.cli.train import stop_on_signal
+    from telebip.env import TelebipEnv
+    from telebip.rl.checkpoint import load_checkpoint
+    from telebip.rl.process import prepare_cpu
+    from telebip.rl.run import describe_run
+    from telebip.rl.train import Trainer
+    from telebip.robot import load_robot
+
+    run_dir = Path(options.runs) / f"{training.name}-seed{seed}"
+    config = load_task(training.task, [f"seed={seed}", *training.overrides, *(QUICK_TRAINING if options.quick else ())])
+    checkpoint = load_checkpoint(run_dir) if any(run_dir.glob("model_*.pt")) else None
+    if checkpoint and checkpoint.iteration >= config.ppo.max_iterations:
+        console.print(f"{training.name}, seed {seed}: trained already, {checkpoint.samples / 1e6:.1f} M samples in {run_dir}")
+        return run_dir
+    device = resolve_device(options.device)
+    if device.type == "cpu":
+        prepare_cpu()
+    try:
+        run_dir.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"cannot write to '{run_dir}': {error.strerror or error}") from error
+    trainer = Trainer(TelebipEnv(config, load_robot(config.sim.robot), device), training.task, run_dir)
+    if checkpoint:
+        trainer.resume(checkpoint)
+    console.print(f"{training.name}, seed {seed}: training in {run_dir}, from iteration {trainer.iteration}")
+    describe_run(run_dir, config, str(device), "auto")
+    with stop_on_signal(console) as stop, training_bar(console, trainer) as show:
+        trainer.learn(stop, show)
+    if trainer.iteration < config.ppo.max_iterations:
+        console.print("stopped; the same command goes on from here")
+        return None
+    return run_dir
+
+
+def _measure(console, out: Path, walker, options: argparse.Namespace, make_subject) -> None:
+    """Measure one walker, unless its results are there, newer than its policy and complete."""
+    from telebip.eval.report import make_folder, read_results, write_results
+    from telebip.eval.suites import Protocol, evaluate
+    from telebip.robot import load_robot
+
+    subject = make_subject()
+    protocol = _quick_protocol() if options.quick else Protocol(device=resolve_device(options.device))
+    file = out / "results.json"
+    if file.is_file() and not options.again:
+        done = read_results(file)
+        if set(walker.suites) <= done.keys() and done["fingerprint"] == subject.fingerprint:
+            console.print(f"{walker.name}: measured already")
+            return
+    make_folder(out)
+    with progress_bar(console) as show:
+        results = evaluate(subject, load_robot(subject.config.sim.robot), walker.suites, protocol, show)
+    write_results(results, out)
+    console.print(f"{walker.name}: measured, see {file}")
+
+
+def _quick_protocol():
+    from telebip.eval.push import PushProtocol
+    from telebip.eval.suites import Protocol
+
+    push = PushProtocol(max_force=10.0, worlds=2, warmup=0.5, horizons=(1.0, 2.0))
+    return Protocol(worlds=4, duration=3.0, skip=1.0, push=push)
+
+
+def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = Parser("Train and measure every policy of the study and both model-based walkers, and report.", EXAMPLES)
+    parser.add_argument(
+        "--out", default="docs/results", metavar="DIR", help="where results and report go (default: docs/results)"
+    )
+    parser.add_argument("--runs", default="runs/study", metavar="DIR", help="where trainings go (default: runs/study)")
+    parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="these walkers alone")
+    parser.add_argument("--shipped", action="store_true", help="measure the policies in assets/policies instead of training")
+    parser.add_argument("--again", action="store_true", help="measure again what has been measured")
+    parser.add_argument("--quick", action="store_true", help="toy size: two iterations, four worlds")
+    parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto, which prefers CUDA)")
+    return parser.parse(argv)

@@ -1,0 +1,158 @@
+"""The report's plots. Each takes results as `telebip.eval.suites.evaluate` returns them and draws what they hold."""
+
+import io
+from collections.abc import Sequence
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+
+Results = dict[str, Any]
+
+COLORS = ("#e8731f", "#29598f", "#3f8f5f", "#8a5aa8", "#c2455a", "#7a6a3a", "#2f9fa8", "#555b66")
+GREYS = ("#9aa0a8", "#b6bac0", "#ced1d6")
+STYLE: Any = {
+    "font.size": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e4e6ea",
+    "grid.linewidth": 0.8,
+    "axes.edgecolor": "#8b9099",
+    "axes.titlesize": 10,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "legend.frameon": False,
+    "svg.hashsalt": "telebip",  # the same numbers give the same file
+}
+
+
+def svg(figure: Figure) -> str:
+    """Return a figure as an SVG element, and close it."""
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", bbox_inches="tight", metadata={"Date": None})
+    plt.close(figure)
+    text = buffer.getvalue()
+    return text[text.index("<svg") :]
+
+
+def color(index: int, label: str) -> str:
+    """Colour of the method at a position of the list: a grey for the article's own numbers."""
+    return GREYS[index % len(GREYS)] if label.startswith("article") else COLORS[index % len(COLORS)]
+
+
+def speed(results: Results) -> Figure:
+    """Mean forward speed against time, with the command."""
+    series = results["series"]["speed"]
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(figsize=(7.2, 2.8))
+        commands = [name for name in series if name != "time_s"]
+        for i, name in enumerate(commands):
+            axes.plot(series["time_s"], series[name], color=COLORS[i], lw=1.4, label=f"{float(name):g} m/s")
+            axes.axhline(float(name), color=COLORS[i], lw=0.9, ls=(0, (4, 3)))
+        axes.axvspan(0, results["protocol"]["skip_s"], color="#f3f4f6", zorder=0)
+        axes.set(xlabel="time [s]", ylabel="speed [m/s]", title=f"{results['label']}: speed, and what was commanded (dashed)")
+        axes.set_xlim(0, series["time_s"][-1])
+        axes.legend(ncols=len(commands), loc="lower right")
+    return figure
+
+
+def feet(results: Results) -> Figure:
+    """Force on each foot over two seconds, with the half periods in which the phase signal asks for it."""
+    s = results["series"]["feet"]
+    time = np.array(s["time_s"])
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(figsize=(7.2, 2.3))
+        phase = np.array(s["phase_right"])
+        top = 1.05 * max(*s["right_bw"], *s["left_bw"], 0.1)
+        axes.fill_between(time, 0, top, where=(phase > 0).tolist(), step="mid", color=COLORS[0], alpha=0.08, lw=0)
+        axes.fill_between(time, 0, top, where=(phase < 0).tolist(), step="mid", color=COLORS[1], alpha=0.08, lw=0)
+        axes.plot(time, s["right_bw"], color=COLORS[0], lw=1.5, label="right foot")
+        axes.plot(time, s["left_bw"], color=COLORS[1], lw=1.5, label="left foot")
+        axes.set(xlabel="time [s]", ylabel="force [body weights]", ylim=(0, top))
+        axes.set_title(f"{results['label']}: forces on the feet at {s['command_mps']:g} m/s (shaded: whose turn it is)")
+        axes.set_xlim(time[0], time[-1])
+        axes.legend(ncols=2, loc="upper right")
+    return figure
+
+
+def cost_of_transport(all_results: Sequence[Results], commands: Sequence[float] = (0.5, 0.7, 1.0)) -> Figure:
+    """Cost of transport by method and commanded speed; the article's formula, which is what the article reports."""
+    shown = [r for r in all_results if any(row["command_mps"] in commands for row in r.get("tracking", ()))]
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(figsize=(7.2, 3.0))
+        width = 0.84 / max(1, len(shown))
+        for i, results in enumerate(shown):
+            costs = {row["command_mps"]: row["cot_article"] for row in results["tracking"]}
+            x = [k + (i - 0.5 * (len(shown) - 1)) * width for k, command in enumerate(commands) if command in costs]
+            y = [costs[command] for command in commands if command in costs]
+            bars = axes.bar(x, y, 0.92 * width, color=color(i, results["label"]), label=results["label"])
+            axes.bar_label(bars, fmt="%.2f", fontsize=7, padding=1)
+        axes.set_xticks(range(len(commands)), [f"{command:g} m/s" for command in commands])
+        axes.grid(axis="x", visible=False)
+        axes.set(ylabel="cost of transport [-]", title="Cost of transport (lower is better)")
+        axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return figure
+
+
+def push(all_results: Sequence[Results], horizon: str = "10s") -> Figure:
+    """Largest push survived, by method and direction."""
+    shown = [r for r in all_results if horizon in (r.get("push") or {})]
+    directions = ("forward", "backward", "lateral")
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(figsize=(7.2, 3.0))
+        width = 0.84 / max(1, len(shown))
+        for i, results in enumerate(shown):
+            x = [k + (i - 0.5 * (len(shown) - 1)) * width for k in range(3)]
+            values = [results["push"][horizon][f"{name}_n"] for name in directions]
+            bars = axes.bar(x, values, 0.92 * width, color=color(i, results["label"]), label=results["label"])
+            axes.bar_label(bars, fmt="%.0f", fontsize=7, padding=1)
+        axes.set_xticks(range(3), ["forward", "backward", "lateral (worse side)"])
+        axes.grid(axis="x", visible=False)
+        axes.set(ylabel="force for 0.1 s [N]", title=f"Largest push survived during {horizon.removesuffix('s')} s of walking")
+        axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return figure
+
+
+def joints(results: Results) -> Figure:
+    """Where the energy goes: each actuator's share of the cost of transport."""
+    rows = results["tracking"]
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(figsize=(7.2, 0.7 + 0.42 * len(rows)))
+        names = list(rows[0]["cot_joints"])
+        left = np.zeros(len(rows))
+        for i, name in enumerate(names):
+            share = np.array([row["cot_joints"][name] or 0.0 for row in rows])
+            side = 1.0 if name.startswith("right") else 0.55
+            axes.barh(range(len(rows)), share, left=left, color=COLORS[i % 3], alpha=side, label=name.replace("_", " "))
+            left += share
+        axes.set_yticks(range(len(rows)), [f"{row['command_mps']:g} m/s" for row in rows])
+        axes.invert_yaxis()
+        axes.grid(axis="y", visible=False)
+        axes.set(xlabel="cost of transport [-]", title=f"{results['label']}: which actuator pays")
+        axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=7)
+    return figure
+
+
+def learning(all_results: Sequence[Results]) -> Figure:
+    """Episode length and velocity error against samples."""
+    shown = [(i, r) for i, r in enumerate(all_results) if r.get("learning")]
+    with plt.rc_context(STYLE):
+        figure, (left, right) = plt.subplots(1, 2, figsize=(9.2, 2.8))
+        for i, results in shown:
+            curve = results["learning"]
+            samples = np.array(curve["samples"]) / 1e6
+            for axes, name in ((left, "episode_length"), (right, "velocity_error_mps")):
+                values = np.array([np.nan if v is None else v for v in curve[name]], dtype=float)
+                axes.plot(samples, values, color=color(i, results["label"]), lw=1.4, label=results["label"])
+        left.set(xlabel="million samples", ylabel="policy steps", title="Length of training episodes")
+        right.set(xlabel="million samples", ylabel="m/s", title="Velocity error in training")
+        for axes in (left, right):
+            axes.set_ylim(bottom=0)
+        right.legend()
+    return figure

@@ -1,0 +1,117 @@
+"""How hard a walking robot can be pushed: the largest force that every world survives, in each direction."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from telebip.control.policy import Policy
+from telebip.env import TelebipEnv
+from telebip.mdp.randomization import uniform
+
+DIRECTIONS = {"forward": (1.0, 0.0), "backward": (-1.0, 0.0), "left": (0.0, 1.0), "right": (0.0, -1.0)}
+"""Unit vectors in the plane, x forward and y left of a robot that faces x."""
+
+
+@dataclass(frozen=True)
+class PushProtocol:
+    """A force on the trunk's centre of mass, again and again while the robot walks.
+
+    The first push comes `warmup` seconds after the start plus a random part of the interval, so that with an interval that is
+    no multiple of the gait period the pushes meet all phases of the gait.
+    """
+
+    command: float = 0.7  # m/s, forward
+    duration: float = 0.1  # s, of one push
+    interval: float = 1.1  # s, from the start of one push to the next
+    warmup: float = 2.0  # s
+    horizons: tuple[float, ...] = (10.0, 20.0)  # s of walking under pushes
+    force_step: float = 5.0  # N
+    max_force: float = 300.0  # N
+    worlds: int = 32  # for each force and direction
+
+    @property
+    def forces(self) -> NDArray[np.floating]:
+        """All forces, from the smallest up [N], (forces,)."""
+        return self.force_step * np.arange(1, round(self.max_force / self.force_step) + 1)
+
+    @property
+    def num_envs(self) -> int:
+        """Worlds in all: every force in every direction at once."""
+        return len(self.forces) * len(DIRECTIONS) * self.worlds
+
+    @property
+    def seconds(self) -> float:
+        """Length of the whole trial [s]."""
+        return self.warmup + max(self.horizons)
+
+
+def largest_survived(survived: NDArray[np.bool_], forces: NDArray[np.floating]) -> float:
+    """Return the largest force that all worlds survive, as they do every smaller one [N]; 0 if they fail at the first.
+
+    Args:
+        survived: (forces, worlds), in the order of `forces`.
+        forces: from the smallest up [N], (forces,).
+    """
+    passed = int(np.cumprod(survived.all(1)).sum())
+    return float(forces[passed - 1]) if passed else 0.0
+
+
+def push_limits(survival_s: NDArray[np.floating], protocol: PushProtocol, weight: float) -> dict[str, dict[str, float]]:
+    """Reduce survival times to limits.
+
+    Args:
+        survival_s: time that each world walked under pushes before it fell [s], infinite if it did not,
+            (forces, directions, worlds).
+        protocol: what was done.
+        weight: m g [N].
+
+    Returns:
+        For each horizon ("10s"): `forward_n`, `backward_n`, `lateral_n` (of left and right the worse) [N], the same as impulses
+        (`forward_ns` [N s]) and as fractions of the weight (`forward_bw` [-]).
+    """
+    table = {}
+    for horizon in protocol.horizons:
+        limit = {name: largest_survived(survival_s[:, i] >= horizon, protocol.forces) for i, name in enumerate(DIRECTIONS)}
+        force = {"forward": limit["forward"], "backward": limit["backward"], "lateral": min(limit["left"], limit["right"])}
+        table[f"{horizon:g}s"] = {
+            **{f"{name}_n": value for name, value in force.items()},
+            **{f"{name}_ns": round(value * protocol.duration, 6) for name, value in force.items()},
+            **{f"{name}_bw": round(value / weight, 4) for name, value in force.items()},
+        }
+    return table
+
+
+def push_trial(
+    env: TelebipEnv, policy: Policy, protocol: PushProtocol, progress: Callable[[int], None] = lambda step: None
+) -> NDArray[np.floating]:
+    """Push every world of `env` and return how long each walked, (forces, directions, worlds) [s], infinite if to the end.
+
+    Args:
+        env: `protocol.num_envs` worlds of a task whose own pushes are off, and whose robots start facing x.
+        policy: what walks.
+        protocol: when and how hard.
+        progress: called with the number of finished policy steps.
+    """
+    shape = (len(protocol.forces), len(DIRECTIONS), protocol.worlds)
+    force = torch.as_tensor(protocol.forces, dtype=torch.float32, device=env.device)[:, None, None, None]
+    direction = torch.tensor(list(DIRECTIONS.values()), device=env.device)[None, :, None]
+    push = (force * direction).expand(*shape, 2).reshape(-1, 2)
+    first = protocol.warmup + uniform((env.num_envs,), 0.0, protocol.interval, env.generator)
+    survival = torch.full((env.num_envs,), torch.inf, device=env.device)
+    env.set_command(protocol.command, 0.0, 0.0)
+    with torch.inference_mode():
+        policy.reset(torch.ones(env.num_envs, dtype=torch.bool, device=env.device))
+        obs = env.get_observations()
+        for step in range(round(protocol.seconds / env.step_dt)):
+            since = step * env.step_dt - first
+            pushing = (since > -1e-6) & (torch.remainder(since + 1e-6, protocol.interval) < protocol.duration)
+            env.push_wrench_w[:, :2] = push * pushing[:, None]
+            obs, _, dones, _ = env.step(policy(obs))
+            policy.reset(dones)
+            walked = max(0.0, (step + 1) * env.step_dt - protocol.warmup)
+            survival = torch.where(dones & survival.isinf(), walked, survival)
+            progress(step + 1)
+    return survival.reshape(shape).cpu().numpy()

@@ -1,0 +1,209 @@
+"""Results as files: `results.json` for programs, `report.md` for reading, `report.html` with plots, complete in one file."""
+
+import html
+import json
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from telebip.errors import UserError
+from telebip.eval import plots
+
+Results = dict[str, Any]
+Table = tuple[str, list[str], list[list[str]]]
+"""Title, header and rows."""
+
+
+def write_report(
+    all_results: Sequence[Results], out: Path, title: str, text: str = "", references: Sequence[Results] = ()
+) -> None:
+    """Write `report.md` and `report.html` about one or several walkers to the folder `out`.
+
+    Args:
+        all_results: as `telebip.eval.suites.evaluate` returns them.
+        out: an existing folder.
+        title: of the report.
+        text: paragraphs under the title, separated by blank lines.
+        references: results to compare with, such as the article's; they stand in the same tables and plots.
+    """
+    tables = [table for table in _tables([*all_results, *references]) if table[2]]
+    markdown = [f"# {title}", *([text] if text else [])]
+    markdown += [f"## {heading}\n\n{_markdown(header, rows)}" for heading, header, rows in tables]
+    page = [f"<h1>{html.escape(title)}</h1>", *(f"<p>{html.escape(p)}</p>" for p in text.split("\n\n") if p)]
+    page += [f"<figure>{plots.svg(figure())}</figure>" for figure in _figures(all_results, references)]
+    page += [f"<h2>{html.escape(heading)}</h2>{_html(header, rows)}" for heading, header, rows in tables]
+    write(out / "report.md", "\n\n".join(markdown) + "\n")
+    write(out / "report.html", _PAGE.format(title=html.escape(title), body="\n".join(page)))
+
+
+def write_results(results: Results, out: Path) -> None:
+    """Write `results.json`; numbers that are not finite become null, which JSON can hold."""
+    write(out / "results.json", json.dumps(_finite(results), indent=1) + "\n")
+
+
+def read_results(path: Path) -> Results:
+    """Read a `results.json`.
+
+    Raises:
+        UserError: it is missing or damaged.
+    """
+    try:
+        results = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise UserError(f"results '{path}' cannot be read: {error}") from error
+    if not isinstance(results, dict) or results.get("schema") != "telebip-results-1":
+        raise UserError(f"'{path}' holds no results of this version of telebip")
+    return results
+
+
+def make_folder(out: Path) -> None:
+    """Create the folder `out` and make sure, before the long work, that it can be written to.
+
+    Raises:
+        UserError: it cannot.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / ".probe").touch()
+        (out / ".probe").unlink()
+    except OSError as error:
+        raise UserError(f"cannot write to folder '{out}': {error.strerror or error}") from error
+
+
+def write(path: Path, text: str) -> None:
+    """Write a text file.
+
+    Raises:
+        UserError: it cannot be written.
+    """
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise UserError(f"cannot write '{path}': {error.strerror or error}") from error
+
+
+def _figures(all_results: Sequence[Results], references: Sequence[Results]) -> list[Callable[[], Any]]:
+    together = [*all_results, *references]
+    figures: list[Callable[[], Any]] = []
+    if any("tracking" in r for r in all_results):
+        figures.append(lambda: plots.cost_of_transport(together))
+    for horizon in ("10s", "20s"):
+        if any(horizon in (r.get("push") or {}) for r in all_results):
+            figures.append(lambda horizon=horizon: plots.push(together, horizon))
+    if any(r.get("learning") for r in all_results):
+        figures.append(lambda: plots.learning(all_results))
+    for results in all_results:
+        if "series" in results:
+            figures.append(lambda r=results: plots.speed(r))
+            figures.append(lambda r=results: plots.feet(r))
+        if "tracking" in results:
+            figures.append(lambda r=results: plots.joints(r))
+    return figures
+
+
+def _tables(all_results: Sequence[Results]) -> list[Table]:
+    def rows(suite: str, fill: Callable[[Any], list[list[str]]]) -> list[list[str]]:
+        return [[r["label"], *row] for r in all_results if r.get(suite) for row in fill(r[suite])]
+
+    horizons = sorted({h for r in all_results for h in (r.get("push") or {}) if h != "protocol"}, key=lambda h: float(h[:-1]))
+    return [
+        (
+            "Tracking and cost of transport",
+            ["walker", "command [m/s]", "mean speed [m/s]", "error", "RMS error [m/s]", "falls", "yaw drift [deg]"]
+            + ["COT mechanical", "COT article", "COT positive"],
+            rows("tracking", lambda suite: [_tracking_cells(row) for row in suite]),
+        ),
+        *(
+            (
+                f"Largest push survived, {horizon.removesuffix('s')} s of walking",
+                ["walker", "forward [N]", "backward [N]", "lateral [N]", "as impulse [N s]", "of body weight"],
+                [[r["label"], *_push_cells(r["push"][horizon])] for r in all_results if horizon in (r.get("push") or {})],
+            )
+            for horizon in horizons
+        ),
+        (
+            "Gait",
+            ["walker", "command [m/s]", "period [s]", "regularity", "symmetry", "duty factor", "double support", "flight"]
+            + ["peak force [body weights]", "stride [m]", "knee stroke [m]"],
+            rows("gait", lambda suite: [[number(value, 3) for value in suite.values()]]),
+        ),
+        (
+            "Learning",
+            ["walker", "samples", "to 95 % of the final episode length", "to 95 % of the final return"],
+            rows(
+                "learning",
+                lambda s: [
+                    [_millions(s["samples"][-1]), _millions(s["samples_to_95_length"]), _millions(s["samples_to_95_return"])]
+                ],
+            ),
+        ),
+    ]
+
+
+def _tracking_cells(row: dict[str, Any]) -> list[str]:
+    interval = f" ± {row['ci95_mps']:.3f}" if row.get("ci95_mps") else ""
+    return [
+        number(row["command_mps"], 2),
+        number(row["mean_speed_mps"], 3) + interval,
+        f"{100.0 * (row['mean_speed_mps'] / row['command_mps'] - 1.0):+.1f} %" if row["command_mps"] else "-",
+        number(row.get("rms_error_mps"), 3),
+        f"{row['falls']} of {row['worlds']}" if "falls" in row else "-",
+        number(row.get("yaw_drift_deg"), 1),
+        number(row.get("cot_mechanical"), 3),
+        number(row.get("cot_article"), 3),
+        number(row.get("cot_positive"), 3),
+    ]
+
+
+def _push_cells(limits: dict[str, float]) -> list[str]:
+    names = ("forward", "backward", "lateral")
+    return [
+        *(number(limits[f"{name}_n"], 0) for name in names),
+        " / ".join(number(limits.get(f"{name}_ns"), 1) for name in names),
+        " / ".join(number(limits.get(f"{name}_bw"), 2) for name in names),
+    ]
+
+
+def number(value: float | None, digits: int) -> str:
+    """Return a number with its digits, and a dash where there is none."""
+    return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
+
+
+def _millions(value: float | None) -> str:
+    return "-" if value is None else f"{value / 1e6:.1f} M"
+
+
+def _markdown(header: list[str], rows: list[list[str]]) -> str:
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in [header, ["---"] * len(header), *rows])
+
+
+def _html(header: list[str], rows: list[list[str]]) -> str:
+    def line(cells: list[str], tag: str) -> str:
+        return "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells) + "</tr>"
+
+    return f"<table><thead>{line(header, 'th')}</thead><tbody>{''.join(line(row, 'td') for row in rows)}</tbody></table>"
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+_PAGE = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><title>{title}</title>
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<style>
+body {{ font: 15px/1.5 system-ui, sans-serif; color: #22262c; max-width: 68rem; margin: 2rem auto; padding: 0 1rem; }}
+h1 {{ font-size: 1.7rem; }} h2 {{ font-size: 1.15rem; margin-top: 2rem; }}
+figure {{ margin: 1.2rem 0; }} figure svg {{ max-width: 100%; height: auto; }}
+table {{ border-collapse: collapse; font-size: 0.86rem; display: block; overflow-x: auto; }}
+th, td {{ padding: 0.25rem 0.7rem; text-align: right; border-bottom: 1px solid #e4e6ea; white-space: nowrap; }}
+th:first-child, td:first-child {{ text-align: left; }} th {{ border-bottom: 2px solid #8b9099; white-space: normal; }}
+</style></head><body>
+{body}
+</body></html>
+"""

@@ -1,0 +1,94 @@
+"""The prepared layouts of recordings in the rerun viewer: the robots on the left, time series on the right."""
+
+from collections.abc import Sequence
+
+import rerun.blueprint as rrb
+
+AROUND_THE_CURSOR = rrb.VisibleTimeRange(
+    "time",
+    start=rrb.TimeRangeBoundary.cursor_relative(seconds=-2.0),
+    end=rrb.TimeRangeBoundary.cursor_relative(seconds=2.0),
+)
+"""Strides can be told apart in four seconds; over a whole walk they run together."""
+
+
+def walk_layout(robots: Sequence[str], titles: dict[str, str]) -> rrb.Blueprint:
+    """Lay out a recording of walks.
+
+    Args:
+        robots: their entities' names below `world` and `plot`, from left to right; the camera follows the middle one.
+        titles: title of each plot, by its entity's name below `plot/<robot>`.
+    """
+
+    def plot(name: str, *shown: str, whole: bool = False) -> rrb.TimeSeriesView:
+        return rrb.TimeSeriesView(
+            name=titles[name],
+            origin="/plot",
+            contents=[f"+ /plot/{robot}/{name}/**" for robot in shown]
+            + [f"- /plot/{robot}/{name}/command" for robot in shown[1:]],  # it would be drawn over the first one's
+            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop),
+            time_ranges=None if whole else AROUND_THE_CURSOR,
+            axis_y=rrb.ScalarAxis(range=(0.0, 1.5)) if name == "cost_of_transport" else None,  # a start costs far more
+        )
+
+    def details(robot: str, name: str | None = None) -> rrb.Vertical:
+        return rrb.Vertical(
+            plot("gait", robot),
+            rrb.Tabs(*(plot(joint, robot) for joint in ("hip_pitch", "knee", "hip_roll"))),
+            rrb.Tabs(*(plot(effort, robot) for effort in ("power", "torque", "knee_force"))),
+            plot("reward", robot),
+            name=name,
+            row_shares=[3, 2, 2, 2],
+        )
+
+    motion = rrb.Tabs(
+        plot("speed", *robots, whole=True), plot("side_speed", *robots, whole=True), plot("yaw_rate", *robots, whole=True)
+    )
+    below = details(robots[0]) if len(robots) == 1 else rrb.Tabs(*(details(robot, robot.replace("_", " ")) for robot in robots))
+    series = rrb.Vertical(motion, plot("cost_of_transport", *robots, whole=True), below, row_shares=[2, 2, 9])
+    return rrb.Blueprint(
+        rrb.Horizontal(robots_view(f"/world/{robots[len(robots) // 2]}/trunk", len(robots)), series, column_shares=[3, 2]),
+        rrb.TimePanel(timeline="time", play_state="playing", loop_mode="all", state="collapsed"),
+        collapse_panels=True,
+    )
+
+
+def training_layout(curves: dict[str, Sequence[str]]) -> rrb.Blueprint:
+    """Lay out the live view of a training.
+
+    Args:
+        curves: entities of the learning curves for each plot, by its title.
+    """
+    charts = [
+        rrb.TimeSeriesView(
+            name=title, origin="/", contents=list(entities), plot_legend=rrb.PlotLegend(visible=len(entities) > 1)
+        )
+        for title, entities in curves.items()
+    ]
+    return rrb.Blueprint(
+        rrb.Horizontal(robots_view(None, 4), rrb.Grid(*charts, grid_columns=2), column_shares=[1, 1]),
+        rrb.TimePanel(timeline="samples", play_state="following", state="collapsed"),
+        collapse_panels=True,
+    )
+
+
+def robots_view(followed: str | None, robots: int) -> rrb.Spatial3DView:
+    """Show everything below `world` on a floor grid of half metres, from the right and the front.
+
+    Args:
+        followed: entity that the camera follows, if any.
+        robots: how many have to fit into the picture.
+    """
+    away = 1.0 + 0.35 * (robots - 1)
+    return rrb.Spatial3DView(
+        name="robots" if robots > 1 else "robot",
+        origin="/world",
+        background=[205, 215, 226],
+        line_grid=rrb.LineGrid3D(visible=True, spacing=0.5, color=[120, 130, 140]),
+        eye_controls=rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital,
+            position=[1.2 * away, -2.0 * away, 0.8 * away],
+            look_target=[0.0, 0.0, 0.45],
+            tracking_entity=followed,
+        ),
+    )

@@ -1,0 +1,41 @@
+"""Who is seen: robots side by side, from any number of rollouts; and how long and in which colour arrows are drawn."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from telebip.eval.rollout import Rollout
+
+LANE = 0.9  # m between robots side by side
+
+Color = tuple[int, int, int]
+FORCE_SCALE, PUSH_SCALE, SPEED_SCALE = 0.001, 0.006, 0.5  # m of arrow per N, per N, and per m/s
+GROUND_FORCE, PUSH, COMMAND, ACTUAL = (60, 230, 130), (230, 40, 40), (110, 110, 120), (250, 190, 50)
+
+
+@dataclass(frozen=True)
+class Actor:
+    """One world of a rollout, on a lane of its own."""
+
+    label: str
+    rollout: Rollout
+    world: int
+    lane: float = 0.0  # how far it is moved along y [m]
+
+
+def line_up(rollouts: Sequence[tuple[str, Rollout]], worlds: int = 1) -> list[Actor]:
+    """Place the first `worlds` worlds of every labelled rollout side by side, from left to right, centred.
+
+    Args:
+        rollouts: what happened, each with the name it is shown under: policies that walked the same command, say.
+        worlds: how many of each at most.
+    """
+    places = [(label, rollout, i) for label, rollout in rollouts for i in range(min(worlds, rollout.qpos.shape[1]))]
+    return [
+        Actor(
+            label=label if min(worlds, rollout.qpos.shape[1]) == 1 else f"{label} {world + 1}",
+            rollout=rollout,
+            world=world,
+            lane=LANE * (0.5 * (len(places) - 1) - i),
+        )
+        for i, (label, rollout, world) in enumerate(places)
+    ]

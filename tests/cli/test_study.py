@@ -1,0 +1,61 @@
+"""`evaluate.py` and `reproduce.py` as a user runs them."""
+
+import json
+from pathlib import Path
+
+import pytest
+from test_commands_line import ran, refusal
+
+EVALUATE, REPRODUCE = "scripts/evaluate.py", "scripts/reproduce.py"
+SMALL = ("--num-envs", "2", "--duration", "2", "--device", "cpu")
+
+
+def test_evaluate_writes_results_and_reports(tmp_path: Path) -> None:
+    policy = ("--checkpoint", "assets/policies/telebip_flat", "--suite", "tracking,gait", "--commands", "0.7")
+    printed = ran(EVALUATE, *policy, *SMALL, "--out", str(tmp_path), "--label", "mine")
+    assert {file.name for file in tmp_path.iterdir()} == {"results.json", "report.md", "report.html"}
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert (results["label"], [row["command_mps"] for row in results["tracking"]]) == ("mine", [0.7])
+    assert "push" not in results
+    assert "mean speed [m/s]" in printed
+
+
+def test_evaluate_measures_a_model_based_walker_at_the_physics_rate(tmp_path: Path) -> None:
+    suite, overrides = ("--suite", "tracking", "--commands", "0.5"), ("sim.decimation=1", "control.swing_height=0.05")
+    ran(EVALUATE, "--controller", "alip", *suite, *SMALL, "--out", str(tmp_path), *overrides)
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert results["source"] == "evaluate.py --controller alip sim.decimation=1 control.swing_height=0.05"
+    assert results["tracking"][0]["falls"] == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        ([EVALUATE], "--checkpoint"),
+        ([EVALUATE, "--checkpoint", "nowhere"], "checkpoint 'nowhere' does not exist"),
+        ([EVALUATE, "--checkpoint", "assets/policies/telebip_flat", "--suite", "pusj"], "did you mean 'push'?"),
+        ([EVALUATE, "--controller", "dcm", "--commands", "0.5;0.7"], "invalid speeds value: '0.5;0.7'"),
+        ([EVALUATE, "--checkpoint", "assets/policies/telebip_flat", "--num-envs", "0"], "--num-envs must be between 1"),
+        ([EVALUATE, "--checkpoint", "assets/policies/telebip_flat", "--out", "/proc/x"], "cannot write to folder '/proc/x'"),
+        ([REPRODUCE, "--only", "telebip_flta"], "did you mean 'telebip_flat'?"),
+    ],
+    ids=lambda value: " ".join(value[1:]) if isinstance(value, list) else "",
+)
+def test_a_mistake_is_one_line(arguments: list[str], named: str) -> None:
+    assert named in refusal(*arguments)
+
+
+def test_the_study_at_toy_size_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    where = ("--quick", "--device", "cpu", "--out", str(tmp_path / "out"), "--runs", str(tmp_path / "runs"))
+    only = ("--only", "telebip_efficient", "period_06", "dcm")
+    ran(REPRODUCE, *where, *only)
+    assert {path.name for path in (tmp_path / "runs").iterdir()} == {"telebip_efficient-seed1", "period_06-seed1"}
+    report = (tmp_path / "out" / "report.md").read_text()
+    for label in ("RL, efficient", "RL, period 0.6 s", "DCM", "article: RL"):
+        assert label in report
+    results = tmp_path / "out" / "telebip_efficient" / "results.json"
+    written = results.stat().st_mtime_ns
+    again = ran(REPRODUCE, *where, *only)
+    assert again.count("trained already") == 2
+    assert again.count("measured already") == 3
+    assert results.stat().st_mtime_ns == written

@@ -1,0 +1,141 @@
+"""The whole evaluator on a few worlds, its results and its report."""
+
+import dataclasses
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from telebip import ROOT
+from telebip.cli.evaluate import references, subject_of
+from telebip.control.policy import Stateless
+from telebip.errors import UserError
+from telebip.eval.learning import learning_curve, samples_to
+from telebip.eval.push import PushProtocol
+from telebip.eval.report import read_results, write_report, write_results
+from telebip.eval.suites import SUITES, Protocol, Subject, check_suites, commands_of, evaluate
+from telebip.robot import Robot
+
+POLICY = "assets/policies/telebip_flat"
+PROTOCOL = Protocol(
+    worlds=4, duration=8.0, skip=3.0, push=PushProtocol(max_force=10.0, worlds=1, warmup=1.0, horizons=(1.0, 2.0))
+)
+
+
+@pytest.fixture(scope="module")
+def subject() -> Subject:
+    return subject_of(POLICY, "flat")
+
+
+@pytest.fixture(scope="module")
+def results(subject: Subject, robot: Robot) -> dict[str, Any]:
+    return evaluate(subject, robot, SUITES, PROTOCOL)
+
+
+def test_tracking_measures_every_trained_command(results: dict[str, Any]) -> None:
+    rows = results["tracking"]
+    assert [row["command_mps"] for row in rows] == [0.5, 0.7, 1.0]  # backward was not trained
+    for row in rows:
+        assert row["mean_speed_mps"] == pytest.approx(row["command_mps"], rel=0.06)
+        assert (row["falls"], row["worlds"]) == (0, 4)
+        assert row["cot_mechanical"] < row["cot_article"] < row["cot_mechanical"] + 0.01
+        assert 0.0 < row["cot_positive"] < row["cot_mechanical"]
+        assert sum(row["cot_joints"].values()) == pytest.approx(row["cot_mechanical"], abs=1e-4)
+
+
+def test_gait_and_pushes(results: dict[str, Any]) -> None:
+    assert results["gait"]["period_s"] == pytest.approx(0.5, rel=0.02)
+    assert 0.8 < results["gait"]["symmetry"] <= 1.0
+    assert results["push"]["1s"] == {
+        **dict.fromkeys(("forward_n", "backward_n", "lateral_n"), 10.0),
+        **dict.fromkeys(("forward_ns", "backward_ns", "lateral_ns"), 1.0),
+        **dict.fromkeys(("forward_bw", "backward_bw", "lateral_bw"), round(10.0 / (13.6 * 9.81), 4)),
+    }
+
+
+def test_the_same_seed_gives_the_same_results(subject: Subject, robot: Robot) -> None:
+    protocol = dataclasses.replace(PROTOCOL, duration=3.0, skip=1.0)
+    a, b = (evaluate(subject, robot, ("tracking", "gait"), protocol) for _ in range(2))
+    assert a["gait"]["period_s"] > 0.0
+    assert a | {"date": ""} == b | {"date": ""}
+
+
+def test_every_field_of_the_results_is_described(results: dict[str, Any]) -> None:
+    text = (ROOT / "docs" / "evaluation.md").read_text(encoding="utf-8")
+    described = set(re.findall(r"`(\w+)`", text))
+
+    def names(node: Any) -> set[str]:
+        if isinstance(node, dict):
+            keys = {key for key in node if not re.fullmatch(r"[-\d.]+s?|(right|left)_(hip_roll|hip_pitch|knee)", key)}
+            return keys.union(*(names(value) for value in node.values()))
+        return set().union(*map(names, node)) if isinstance(node, list) else set()
+
+    assert names(results) - described == set()
+
+
+def test_results_are_json_and_come_back(results: dict[str, Any], tmp_path: Path) -> None:
+    write_results(results | {"nothing": float("nan"), "far": [float("inf")]}, tmp_path)
+    json.loads((tmp_path / "results.json").read_text(), parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+    back = read_results(tmp_path / "results.json")
+    assert (back["nothing"], back["far"]) == (None, [None])
+    assert back["tracking"] == results["tracking"]
+
+
+def test_the_report_shows_the_numbers_beside_the_articles_in_one_file(results: dict[str, Any], tmp_path: Path) -> None:
+    write_report([results], tmp_path, "How <it> walks", "First.\n\nSecond.", references())
+    markdown, page = ((tmp_path / f"report.{suffix}").read_text() for suffix in ("md", "html"))
+    speed = f"{results['tracking'][1]['mean_speed_mps']:.3f}"
+    for text in (markdown, page):
+        assert speed in text
+        assert "0.693" in text  # the article's mean speed at 0.7 m/s
+        assert "angular momentum" in text
+    assert page.count("<svg") == 4  # cost of transport, speed, feet, joints: there is no push of ten seconds here
+    assert "How &lt;it&gt; walks" in page
+    assert not re.search(r"(src|href)=\"http", page)  # complete in itself
+
+
+def test_broken_results_are_named(tmp_path: Path) -> None:
+    file = tmp_path / "results.json"
+    for content in ("{", "[]", '{"schema": "other"}'):
+        file.write_text(content)
+        with pytest.raises(UserError, match=r"results\.json"):
+            read_results(file)
+
+
+def test_suites_are_checked_and_ordered() -> None:
+    assert check_suites(["gait", "tracking"]) == ("tracking", "gait")
+    with pytest.raises(UserError, match=r"unknown suite 'trakcing'; did you mean 'tracking'\?"):
+        check_suites(["trakcing"])
+
+
+def test_commands_keep_to_what_was_trained(subject: Subject) -> None:
+    everything = Subject("any", subject.config, lambda env: Stateless(lambda obs: torch.zeros(1, 6)), limited=False)
+    assert commands_of(everything, PROTOCOL) == (0.5, 0.7, 1.0, -0.3)
+    assert commands_of(subject, PROTOCOL) == (0.5, 0.7, 1.0)
+    assert commands_of(subject, dataclasses.replace(PROTOCOL, commands=(0.2,))) == (0.2,)
+
+
+def test_samples_to_a_share_of_the_final_value() -> None:
+    samples = [float(i) for i in range(1, 31)]
+    curve = [min(i / 10, 1.0) * 500.0 for i in range(30)]
+    assert samples_to(samples, curve) == 11.0  # 0.95 x 500 is first reached by the eleventh row
+    assert samples_to([], []) is None
+    assert samples_to([1.0], [-3.0]) is None
+
+
+def test_a_learning_curve_is_thinned_and_a_damaged_one_named(tmp_path: Path) -> None:
+    assert learning_curve(tmp_path) is None
+    columns = "samples,train/episode_length,train/episode_return,error/lin_vel_mps,walk/cost_of_transport,"
+    columns += "walk/falls_per_minute,train/action_std"
+    rows = [f"{i * 1000},{min(i, 50) * 10},{i},0.5,1.0,0,0.5" for i in range(1, 101)]
+    (tmp_path / "learning.csv").write_text("\n".join([columns, *rows]) + "\n")
+    curve = learning_curve(tmp_path, points=20)
+    assert curve is not None
+    assert len(curve["samples"]) == 20
+    assert curve["samples_to_95_length"] == 48_000.0
+    (tmp_path / "learning.csv").write_text("samples,train/episode_length\n1000,many\n")
+    with pytest.raises(UserError, match=r"learning\.csv is damaged"):
+        learning_curve(tmp_path)

@@ -1,0 +1,189 @@
+"""Gymnasium's contract: spaces that hold, episodes that end as declared, its own checker and wrappers, and the same physics."""
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.wrappers.vector import (
+    ClipAction,
+    NormalizeReward,
+    RecordEpisodeStatistics,
+    RescaleAction,
+)
+
+import telebip.gym
+from telebip.config import task_names
+from telebip.errors import UserError
+from telebip.gym.env import ACTION_NAMES, OBSERVATION_NAMES, TelebipVectorEnv
+from telebip.robot import Robot
+
+CALM = tuple(f"disturbance.{name}.enabled=false" for name in ("push", "friction", "noise"))
+SHORT = "episode.length=0.2"  # ten policy steps
+
+
+def make(*overrides: str, num_envs: int = 4, name: str = "telebip/Flat-v0") -> VectorEnv:
+    return gymnasium.make_vec(name, num_envs=num_envs, overrides=overrides)
+
+
+def actions(steps: int, num_envs: int = 4, scale: float = 0.3) -> np.ndarray:
+    return (scale * np.random.default_rng(0).standard_normal((steps, num_envs, 6))).astype(np.float32)
+
+
+def test_every_task_is_registered() -> None:
+    names = {telebip.gym.env_id(task) for task in task_names()}
+    assert {"telebip/Flat-v0", "telebip/Slow-v0", "telebip/Fast-v0", "telebip/Backward-v0"} <= names
+    assert names <= set(gymnasium.registry)
+    env = make(name="telebip/Slow-v0", num_envs=2)
+    assert isinstance(env, TelebipVectorEnv)
+    assert env.worlds.cfg.command.lin_vel_x == (0.4, 0.7)
+    assert env.spec is not None
+    assert env.spec.id == "telebip/Slow-v0"
+
+
+def test_a_wrong_override_is_said_in_one_line() -> None:
+    with pytest.raises(UserError, match=r"did you mean 'gait.period'"):
+        make("gait.perod=1")
+
+
+def test_the_spaces_have_shapes_bounds_and_names(robot: Robot) -> None:
+    env = make(num_envs=3)
+    assert env.observation_space.shape == (3, 33)
+    assert env.action_space.shape == (3, 6)
+    assert env.metadata["observation_names"] == OBSERVATION_NAMES
+    assert env.metadata["action_names"] == ACTION_NAMES
+    assert OBSERVATION_NAMES[2] == "joint_pos/right_knee"
+    assert OBSERVATION_NAMES[24:28] == ("base_quat/w", "base_quat/x", "base_quat/y", "base_quat/z")
+    assert len(OBSERVATION_NAMES) == 33
+    space = env.single_action_space
+    assert isinstance(space, gymnasium.spaces.Box)
+    # Hip roll: range +-0.6 rad, 50 N m / (200 N m/rad) beyond it, scale 0.25 rad. Knee: from home at 0.04 m, scale 0.1 m.
+    assert space.high[0] == pytest.approx((0.6 + 0.25) / 0.25)
+    assert (space.low[2], space.high[2]) == pytest.approx(
+        ((-0.15 - 0.0667 - 0.04) / 0.1, (0.2 + 0.0667 - 0.04) / 0.1), rel=1e-3
+    )
+    seen = env.single_observation_space
+    assert isinstance(seen, gymnasium.spaces.Box)
+    assert seen.high[28:] == pytest.approx([1.0, 0.0, 0.5, 1.0, 1.0], abs=1e-5)  # yaw rate 0.2 and the heading hold's 0.3 rad/s
+    assert np.isinf(seen.high[:12]).all()
+    assert seen.high[12:18] == pytest.approx(space.high)
+
+
+def test_observations_and_actions_stay_in_their_spaces() -> None:
+    env = make(num_envs=16)
+    env.action_space.seed(0)
+    obs, _ = env.reset(seed=0)
+    assert env.observation_space.contains(obs)
+    for _ in range(200):  # wild actions: robots fall, are pushed and get new commands
+        obs, rewards, terminated, truncated, _ = env.step(env.action_space.sample())
+        assert env.observation_space.contains(obs)
+        assert rewards.shape == terminated.shape == truncated.shape == (16,)
+        assert terminated.dtype == truncated.dtype == np.bool_
+
+
+def test_actions_outside_of_the_space_are_clipped_to_it() -> None:
+    env = make(*CALM)
+    env.reset(seed=0)
+    obs, *_ = env.step(np.full((4, 6), 100.0, dtype=np.float32))
+    np.testing.assert_array_equal(obs[:, 12:18], env.action_space.high)  # type: ignore[attr-defined]
+
+
+def test_a_seed_repeats_an_episode_and_another_does_not() -> None:
+    env = make()
+    runs = []
+    for seed in (3, 3, 4):
+        rows = [env.reset(seed=seed)[0], *(env.step(action)[0] for action in actions(20))]
+        runs.append(np.stack(rows))
+    np.testing.assert_array_equal(runs[0], runs[1])
+    assert not np.array_equal(runs[0], runs[2])
+
+
+def test_returned_arrays_are_the_callers() -> None:
+    env = make()
+    first, _ = env.reset(seed=0)
+    kept = first.copy()
+    second, *_ = env.step(actions(1)[0])
+    env.step(actions(1)[0])
+    np.testing.assert_array_equal(first, kept)
+    assert not np.array_equal(second, first)
+
+
+def test_a_time_out_truncates_and_its_final_observation_is_that_of_the_unbroken_episode() -> None:
+    assert TelebipVectorEnv.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
+    short, long = make(SHORT, *CALM), make(*CALM)
+    start, _ = short.reset(seed=1)
+    np.testing.assert_array_equal(long.reset(seed=1)[0], start)
+    for step, action in enumerate(actions(10)):
+        obs, _, terminated, truncated, infos = short.step(action)
+        expected, *_, untouched = long.step(action)
+        assert untouched == {}
+        assert not terminated.any()
+        if step < 9:
+            assert infos == {}
+            np.testing.assert_array_equal(obs, expected)
+    assert truncated.all()
+    assert infos["_final_obs"].all()
+    np.testing.assert_array_equal(np.stack(infos["final_obs"]), expected)
+    np.testing.assert_array_equal(obs[:, 12:18], 0.0)  # the next episode's: no last action
+    assert np.abs(expected[:, 12:18]).min() > 0.0
+
+
+def test_a_fall_terminates_in_its_own_world() -> None:
+    env = make(*CALM)
+    assert isinstance(env, TelebipVectorEnv)
+    env.reset(seed=0)
+    worlds = env.worlds
+    qpos = worlds.sim.state.qpos.clone()
+    qpos[1, 2] = 0.3  # m: hips below the 0.4 m of a fall
+    worlds.sim.reset(worlds.episode_length_buf < 1, qpos, 0.0 * worlds.sim.state.qvel)
+    _, _, terminated, truncated, infos = env.step(actions(1)[0])
+    assert terminated.tolist() == infos["_final_obs"].tolist() == [False, True, False, False]
+    assert not truncated.any()
+    assert infos["final_obs"][0] is None
+    np.testing.assert_array_equal(infos["final_obs"][1][12:18], actions(1)[0][1])  # what it had just done
+
+
+def test_keeping_final_observations_changes_nothing_else(make_env) -> None:
+    overrides = (SHORT, *CALM)
+    env, plain = make(*overrides), make_env(*overrides)
+    obs, _ = env.reset(seed=plain.cfg.seed)
+    plain.generator.manual_seed(plain.cfg.seed)
+    np.testing.assert_array_equal(obs, plain.reset()["policy"].numpy())
+    for action in actions(25):
+        obs, rewards, *_ = env.step(action)
+        expected, expected_rewards, *_ = plain.step(torch.from_numpy(action))
+        np.testing.assert_array_equal(obs, expected["policy"].numpy())
+        np.testing.assert_array_equal(rewards, expected_rewards.numpy())
+
+
+def test_gymnasiums_checker_finds_nothing(recwarn: pytest.WarningsRecorder) -> None:
+    check_env(gymnasium.make("telebip/Flat-v0").unwrapped, skip_render_check=True)
+    advice = ("infinity", "symmetric and normalized")  # velocities have no bounds; RescaleAction normalises actions
+    assert [w for w in recwarn if not any(part in str(w.message) for part in advice)] == []
+
+
+def test_one_world_waits_at_the_end_of_its_episode() -> None:
+    env = gymnasium.make("telebip/Flat-v0", overrides=(SHORT, *CALM))
+    env.reset(seed=0)
+    for step, action in enumerate(actions(10, num_envs=1)[:, 0]):
+        obs, _, terminated, truncated, _ = env.step(action)
+        assert (terminated, truncated) == (False, step == 9)
+    np.testing.assert_array_equal(obs[12:18], action)
+
+
+def test_gymnasiums_wrappers_apply() -> None:
+    """Those that know of same-step resets, that is: the wrappers of observations refuse them."""
+    env = RecordEpisodeStatistics(make(SHORT, *CALM))
+    env.reset(seed=0)
+    for action in actions(21):
+        env.step(action)
+    assert list(env.length_queue) == [10] * 8
+    assert len(env.return_queue) == 8
+
+    wrapped = NormalizeReward(ClipAction(RescaleAction(make(SHORT, *CALM), -1.0, 1.0)))
+    wrapped.reset(seed=0)
+    wrapped.step(np.full((4, 6), 2.0, dtype=np.float32))
+    unwrapped = wrapped.unwrapped
+    assert isinstance(unwrapped, TelebipVectorEnv)
+    np.testing.assert_allclose(unwrapped.worlds.last_action.numpy(), unwrapped.action_space.high, rtol=1e-5)  # type: ignore[attr-defined]
