@@ -23,12 +23,12 @@ def predict_ang_mom(pendulum: Pendulum, time: Tensor) -> Tensor:
         time: t [s], (num_envs,).
 
     Returns:
-        (L_x, L_y) [kg m^2/s], (num_envs, 2).
+        (L_x, L_y) [kg m^2/s], (2, num_envs).
     """
     angle = pendulum.rate * time
     gain = pendulum.mass * pendulum.height * pendulum.rate * angle.sinh()
-    x, y = pendulum.pos.unbind(1)
-    return pendulum.ang_mom * angle.cosh()[:, None] + torch.stack([-gain * y, gain * x], dim=1)
+    x, y = pendulum.pos
+    return pendulum.ang_mom * angle.cosh() + torch.stack([-gain * y, gain * x])
 
 
 def foot_placement(pendulum: Pendulum, step: Step) -> Tensor:
@@ -48,13 +48,13 @@ def foot_placement(pendulum: Pendulum, step: Step) -> Tensor:
         step: the present step and the wanted walk; touch-down is `step.time_left` away.
 
     Returns:
-        Touch-down relative to the centre of mass then, (t_x, t_y) [m], (num_envs, 2).
+        Touch-down relative to the centre of mass then, (t_x, t_y) [m], (2, num_envs).
     """
     mh = pendulum.mass * pendulum.height
     sinh, cosh = torch.sinh(pendulum.rate * step.time), torch.cosh(pendulum.rate * step.time)
-    at_touch_down = predict_ang_mom(pendulum, step.time_left) * cosh[:, None]
-    wanted = (mh * mean_to_end_speed(pendulum.rate, step.time))[:, None] * step.velocity
+    at_touch_down = predict_ang_mom(pendulum, step.time_left) * cosh
+    wanted = mh * mean_to_end_speed(pendulum.rate, step.time) * step.velocity
     sway = step.side * mh * (0.5 * step.width) * pendulum.rate * sinh / (1.0 + cosh)
-    t_x = at_touch_down[:, 1] - wanted[:, 0]
-    t_y = -wanted[:, 1] - sway - at_touch_down[:, 0]
-    return torch.stack([t_x, t_y], dim=1) / (mh * pendulum.rate * sinh)[:, None]
+    t_x = at_touch_down[1] - wanted[0]
+    t_y = -wanted[1] - sway - at_touch_down[0]
+    return torch.stack([t_x, t_y]) / (mh * pendulum.rate * sinh)

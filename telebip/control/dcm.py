@@ -1,8 +1,8 @@
 """The DCM walker: foot placement from the divergent component of motion.
 
 J. Englsberger, C. Ott and A. Albu-Schaeffer, "Three-dimensional bipedal walking control based on divergent component of
-motion", IEEE Transactions on Robotics 31 (2015). Placing the foot at an offset from the predicted DCM: M. Khadiv et al., "Walking
-control based on step timing adaptation", IEEE Transactions on Robotics 36 (2020), here at a fixed step time.
+motion", IEEE Transactions on Robotics 31 (2015). Placing the foot at an offset from the predicted DCM: M. Khadiv et al.,
+"Walking control based on step timing adaptation", IEEE Transactions on Robotics 36 (2020), here at a fixed step time.
 """
 
 import torch
@@ -19,10 +19,9 @@ def predict_dcm(pendulum: Pendulum, time: Tensor) -> Tensor:
         time: t [s], (num_envs,).
 
     Returns:
-        xi [m], (num_envs, 2).
+        xi [m], (2, num_envs).
     """
-    now = pendulum.pos + pendulum.vel / pendulum.rate[:, None]
-    return now * torch.exp(pendulum.rate * time)[:, None]
+    return (pendulum.pos + pendulum.vel / pendulum.rate) * torch.exp(pendulum.rate * time)
 
 
 def dcm_offset(rate: Tensor, step: Step) -> Tensor:
@@ -37,11 +36,11 @@ def dcm_offset(rate: Tensor, step: Step) -> Tensor:
         step: the wanted walk.
 
     Returns:
-        b [m], (num_envs, 2).
+        b [m], (2, num_envs).
     """
     growth = torch.exp(rate * step.time)
-    offset = step.velocity * (step.time / (growth - 1.0))[:, None]
-    offset[:, 1] += step.side * step.width / (1.0 + growth)
+    offset = step.velocity * (step.time / (growth - 1.0))
+    offset[1] += step.side * step.width / (1.0 + growth)
     return offset
 
 
@@ -53,7 +52,7 @@ def foot_placement(pendulum: Pendulum, step: Step) -> Tensor:
         step: the present step and the wanted walk; touch-down is `step.time_left` away.
 
     Returns:
-        Touch-down relative to the centre of mass then, (t_x, t_y) [m], (num_envs, 2).
+        Touch-down relative to the centre of mass then, (t_x, t_y) [m], (2, num_envs).
     """
     contact = predict_dcm(pendulum, step.time_left) - dcm_offset(pendulum.rate, step)
     return contact - pendulum.pos_after(step.time_left)

@@ -2,10 +2,13 @@
 """What the model-based walkers know of the robot: where its mass is, how it moves, and what its legs can do.
 
 Everything is measured from the trunk's frame (midway between the hips) and expressed in it, so that joints alone decide it.
-A leg is hip roll about x, hip pitch about y through the same point, and a knee that slides along the leg; with the hip-to-foot
-vector r, the leg's length l = ||r|| and its length l_0 at knee 0,
+A leg is hip roll about x, hip pitch about y through the same point, and a knee that slides along the leg. With k the unit
+vector from foot to hip, the leg's length l and its length l_0 at knee 0, the foot lies at r from the hip:
 
-    r = l (-sin(pitch), cos(pitch) sin(roll), -cos(pitch) cos(roll)),    l = l_0 - knee.
+    r = -l k,    k = (sin(pitch), -sin(roll) cos(pitch), cos(roll) cos(pitch)),    l = l_0 - knee
+
+Inside the walkers worlds come last and components first, as in (3, num_envs): a number per world then multiplies a vector as it
+is, and each component is contiguous. Of several legs the shape is (3, 2, num_envs), right and left.
 """
 
 from dataclasses import dataclass
@@ -22,19 +25,21 @@ from telebip.robot import FEET, JOINTS, Robot
 
 @dataclass(frozen=True)
 class Motion:
-    """Masses and legs of all worlds, trunk frame; legs right, left."""
+    """Masses and legs of all worlds, trunk frame."""
 
-    com: Tensor  # centre of mass, from the trunk's origin [m], (num_envs, 3)
-    com_vel: Tensor  # velocity of the centre of mass less that of the trunk's origin [m/s], (num_envs, 3)
-    ang_mom: Tensor  # centroidal angular momentum [kg m^2/s], (num_envs, 3)
-    leg: Tensor  # hip to foot centre [m], (num_envs, 2, 3)
-    axes: Tensor  # joint axes (hip roll, hip pitch, knee) [-], (num_envs, 2, 3 joints, 3)
+    com: Tensor  # centre of mass, from the trunk's origin [m], (3, num_envs)
+    com_vel: Tensor  # velocity of the centre of mass less that of the trunk's origin [m/s], (3, num_envs)
+    ang_mom: Tensor  # centroidal angular momentum [kg m^2/s], (3, num_envs)
+    leg: Tensor  # r, hip to foot centre [m], (3, 2, num_envs)
+    pitch_axis: Tensor  # of the hip pitch joints [-], (3, 2, num_envs); the roll joints' is x
+    knee_axis: Tensor  # k, of the knees [-], (3, 2, num_envs)
 
 
 class Kinematics:
-    """Centre of mass, its velocity, and centroidal angular momentum in closed form; exact for rigid links.
+    """Centre of mass, its velocity, and centroidal angular momentum in closed form.
 
-    A leg's bodies move in three groups, the links: one turns with the hip's roll, one with roll and pitch, one slides as well.
+    Trunk and hip links are one body, since a hip link is round about its roll axis; thigh and shank are rods along the leg. For
+    a robot built so, which is checked, nothing is approximated.
     """
 
     def __init__(self, robot: Robot, device: torch.device) -> None:
@@ -51,68 +56,71 @@ class Kinematics:
         data.qpos[:] = 0.0
         data.qpos[3] = 1.0  # at the origin with straight legs: every frame is parallel to the trunk's
         mujoco.mj_kinematics(model, data)
-        links = np.array([_link(model, body) for body in range(model.nbody)])
-        inertial = [_inertial(data, model, np.flatnonzero(links == link)) for link in range(7)]
-        hip = data.xanchor[[model.joint(JOINTS[0]).id, model.joint(JOINTS[3]).id]]
         sites = [int(model.sensor(f"{foot}_force").objid[0]) for foot in FEET]
-        _check_legs(robot, data, hip, data.site_xpos[sites])
+        hip = data.xanchor[[model.joint(JOINTS[0]).id, model.joint(JOINTS[3]).id]]
+        links = np.array([_link(model, body) for body in range(model.nbody)])
+        roll, thigh, shank, *left = [Inertial.of(model, data, np.flatnonzero(links == link)) for link in range(1, 7)]
+        _check_legs(robot, data, hip, data.site_xpos[sites], [roll, thigh, shank], left)
 
-        self.mass = float(sum(mass for mass, _, _ in inertial))  # [kg]
         self.gravity = float(-model.opt.gravity[2])  # [m/s^2]
         self.friction = float(model.geom_friction[robot.floor_id, 0])  # sliding, of the ground [-]
-        self.leg_length = float(hip[0, 2] - data.site_xpos[sites[0], 2])  # hip to foot centre at knee 0 [m]
         self.foot_radius = float(max(model.geom_size[model.geom_bodyid == model.site_bodyid[sites[0]], 0]))  # [m]
-        self.hip = constant(hip)  # (2, 3) [m]
-        self.stiffness = constant(model.actuator_gainprm[:3, 0])  # kp of (roll, pitch, knee) [N m/rad | N/m]
-        self.damping = constant(-model.actuator_biasprm[:3, 2])  # kv [N m s/rad | N s/m]
-        self.force_limit = constant(robot.force_limit[:3])  # [N m | N]
-        self.joint_range = constant(robot.joint_range)  # (6, 2) [rad | m]
-        self._mass = constant([mass for mass, _, _ in inertial])[:, None]
-        self._trunk = constant(inertial[0][1])
-        self._trunk_inertia = constant(inertial[0][2])
-        self._link_com = constant([com for _, com, _ in inertial[1:]]).view(2, 3, 3) - self.hip[:, None]
-        self._link_inertia = constant([inertia for _, _, inertia in inertial[1:]]).view(2, 3, 3, 3)
+        self.leg_length = float(hip[0, 2] - data.site_xpos[sites[0], 2])  # l_0 [m]
+        self.hip = constant(hip.T[:, :, None])  # (3, 2, 1) [m]
+        self.stiffness = constant(model.actuator_gainprm[:3, 0, None])  # kp of roll, pitch, knee [N m/rad | N/m], (3, 1)
+        self.damping = constant(-model.actuator_biasprm[:3, 2, None])  # kv [N m s/rad | N s/m], (3, 1)
+        self.force_limit = constant(robot.force_limit[:3, None])  # [N m | N], (3, 1)
+        self.joint_range = constant(robot.joint_range[:, :, None])  # (6, 2, 1) [rad | m]
 
-    def __call__(self, joint_pos: Tensor, joint_vel: Tensor, base_ang_vel: Tensor) -> Motion:
-        r"""Return where the mass is and how it moves.
+        # The trunk with the hip links, then one leg: masses, first and second moments along the leg, at knee 0.
+        upper = Inertial.of(model, data, np.flatnonzero(np.isin(links, (0, 1, 4))))
+        self.mass = upper.mass + 2.0 * (thigh.mass + shank.mass)  # [kg]
+        self._leg_mass, self._shank_mass = thigh.mass + shank.mass, shank.mass
+        self._thigh_moment = thigh.mass * float(thigh.com[2] - hip[0, 2])
+        self._shank_height = float(shank.com[2] - hip[0, 2])
+        across = thigh.inertia[0, 0] + shank.inertia[0, 0] + self._thigh_moment**2 / thigh.mass
+        self._across, self._along = float(across), float(thigh.inertia[2, 2] + shank.inertia[2, 2])
+        self._roll_inertia = float(roll.inertia[0, 0])
+        self._upper_moment = constant(upper.mass * upper.com[:, None])
+        self._upper_inertia = constant(upper.about_origin())
+        self._straight_com = constant((upper.mass * upper.com + self._leg_mass * hip.sum(0))[:, None] / self.mass)
 
-            c = sum_i m_i p_i / m,    v = sum_i m_i u_i / m,    L_c = sum_i m_i (p_i - c) x u_i + I_i w_i
+    def __call__(self, joint_pos: Tensor, joint_vel: Tensor, ang_vel: Tensor) -> Motion:
+        r"""Return where the mass is and how it moves, from the momentum P and the angular momentum L about the trunk's origin.
 
-        with p_i the links' centres of mass and u_i their velocities, relative to those of the trunk's origin.
+        A leg's mass m_leg has the first moment S = sum m z and the second I = sum m z^2 + I_across along k, from the hip at h.
+        With w the trunk's and W the leg's angular velocity, a = w x h and n = W x k,
+
+            P = w x (m_u c_u) + sum_legs P_leg,    P_leg = m_leg a + S n + m_shank knee' k
+            L = I_u w + sum_legs (I_roll roll' x^ + h x P_leg + k x (S a + I n) + I_along (k . W) k)
+            m c = m_u c_u + sum_legs (m_leg h + S k),    v = P / m,    L_c = L - m c x v
+
+        where u stands for trunk and hip links.
 
         Args:
-            joint_pos: [rad | m], (num_envs, 6).
-            joint_vel: [rad/s | m/s], (num_envs, 6).
-            base_ang_vel: angular velocity of the trunk, trunk frame [rad/s], (num_envs, 3).
+            joint_pos: (roll, pitch, knee) [rad, rad, m], (3, 2, num_envs).
+            joint_vel: [rad/s, rad/s, m/s], (3, 2, num_envs).
+            ang_vel: w, trunk frame [rad/s], (3, num_envs).
         """
-        pos, vel = joint_pos.unflatten(1, (2, 3)), joint_vel.unflatten(1, (2, 3))
-        hip_frame, leg_frame = leg_frames(pos[..., 0], pos[..., 1])
-        axes = torch.stack([hip_frame[..., 0], hip_frame[..., 1], leg_frame[..., 2]], dim=2)
-        leg = (pos[..., 2:] - self.leg_length) * axes[:, :, 2]
+        (roll, pitch, knee), (roll_vel, pitch_vel, knee_vel) = joint_pos, joint_vel
+        (sr, cr), (sp, cp) = (roll.sin(), roll.cos()), (pitch.sin(), pitch.cos())
+        pitch_axis, k = torch.stack([torch.zeros_like(sr), cr, sr]), torch.stack([sp, -sr * cp, cr * cp])
+        leg_rate = ang_vel[:, None] + pitch_vel * pitch_axis
+        leg_rate[0] += roll_vel
+        n, a = cross(leg_rate, k), cross(ang_vel[:, None], self.hip)
+        shank = self._shank_height + knee
+        first = self._thigh_moment + self._shank_mass * shank
+        second = self._across + self._shank_mass * shank * shank
+        p_leg = self._leg_mass * a + first * n + (self._shank_mass * knee_vel) * k
+        along = self._along * (k * leg_rate).sum(0)
+        l_leg = cross(self.hip, p_leg) + cross(k, first * a + second * n) + along * k
 
-        # Arms from the hip to the links' centres of mass, and how the joints move these.
-        frames = torch.stack([hip_frame, leg_frame, leg_frame], dim=2)
-        arm = rotate(frames, self._link_com)
-        arm[:, :, 2] += pos[..., 2:] * axes[:, :, 2]
-        roll_rate = vel[..., :1] * axes[:, :, 0]
-        leg_rate = roll_rate + vel[..., 1:2] * axes[:, :, 1]
-        rate = torch.stack([roll_rate, leg_rate, leg_rate], dim=2)
-        joint_part = torch.linalg.cross(rate, arm)
-        joint_part[:, :, 2] += vel[..., 2:] * axes[:, :, 2]
-
-        trunk = self._trunk.expand(len(pos), 1, 3)
-        point = torch.cat([trunk, (self.hip[:, None] + arm).flatten(1, 2)], dim=1)
-        velocity = torch.linalg.cross(base_ang_vel[:, None].expand_as(point), point)
-        velocity[:, 1:] += joint_part.flatten(1, 2)
-        momentum = self._mass * velocity
-        com = (self._mass * point).sum(1) / self.mass
-        spin = base_ang_vel @ self._trunk_inertia + self._spin(frames, rate + base_ang_vel[:, None, None])
-        ang_mom = torch.linalg.cross(point - com[:, None], momentum).sum(1) + spin
-        return Motion(com=com, com_vel=momentum.sum(1) / self.mass, ang_mom=ang_mom, leg=leg, axes=axes)
-
-    def _spin(self, frames: Tensor, rate: Tensor) -> Tensor:
-        """Return the sum of the links' own angular momenta R I R^T w, (num_envs, 3)."""
-        return rotate(frames, rotate(self._link_inertia, rotate_back(frames, rate))).sum((1, 2))
+        com = self._straight_com + (first * k).sum(1) / self.mass
+        momentum = cross(ang_vel, self._upper_moment) + p_leg.sum(1)
+        ang_mom = self._upper_inertia @ ang_vel + l_leg.sum(1) - cross(com, momentum)
+        ang_mom[0] += self._roll_inertia * roll_vel.sum(0)
+        leg = (knee - self.leg_length) * k
+        return Motion(com, momentum / self.mass, ang_mom, leg, pitch_axis, knee_axis=k)
 
     def inverse(self, leg: Tensor) -> Tensor:
         r"""Joint positions that put the foot at `leg` from the hip, the inverse of the leg's equation above.
@@ -120,14 +128,14 @@ class Kinematics:
             roll = atan2(r_y, -r_z),    pitch = asin(-r_x / l),    knee = l_0 - l
 
         Args:
-            leg: r, hip to foot centre, trunk frame [m], (..., 3).
+            leg: r, hip to foot centre, trunk frame [m], (3, ...).
 
         Returns:
-            (roll, pitch, knee) [rad, rad, m], (..., 3), whatever the joints' ranges.
+            (roll, pitch, knee) [rad, rad, m], (3, ...), whatever the joints' ranges.
         """
-        x, y, z = leg.unbind(-1)
-        length = torch.linalg.vector_norm(leg, dim=-1)
-        return torch.stack([torch.atan2(y, -z), torch.asin(-x / length), self.leg_length - length], dim=-1)
+        x, y, z = leg
+        length = (leg * leg).sum(0).sqrt()
+        return torch.stack([torch.atan2(y, -z), torch.asin(-x / length), self.leg_length - length])
 
     def inverse_rate(self, leg: Tensor, leg_vel: Tensor) -> Tensor:
         r"""Joint velocities that move the foot from `leg` at `leg_vel`, the time derivative of `inverse`.
@@ -135,54 +143,80 @@ class Kinematics:
             roll' = (r_y r_z' - r_z r_y') / (r_y^2 + r_z^2),  l' = r.r' / l,  pitch' = (r_x l'/l - r_x') / sqrt(r_y^2 + r_z^2)
 
         Args:
-            leg: r, hip to foot centre, trunk frame [m], (..., 3).
-            leg_vel: r' [m/s], (..., 3).
+            leg: r, hip to foot centre, trunk frame [m], (3, ...).
+            leg_vel: r' [m/s], (3, ...).
 
         Returns:
-            (roll', pitch', knee') [rad/s, rad/s, m/s], (..., 3).
+            (roll', pitch', knee') [rad/s, rad/s, m/s], (3, ...).
         """
-        (x, y, z), (vx, vy, vz) = leg.unbind(-1), leg_vel.unbind(-1)
+        (x, y, z), (vx, vy, vz) = leg, leg_vel
         across2 = y * y + z * z
         length2 = across2 + x * x
-        stretch = (leg * leg_vel).sum(-1) / length2  # l' / l
+        stretch = (leg * leg_vel).sum(0) / length2  # l' / l
         roll, pitch = (y * vz - z * vy) / across2, (x * stretch - vx) * torch.rsqrt(across2)
-        return torch.stack([roll, pitch, -stretch * torch.sqrt(length2)], dim=-1)
+        return torch.stack([roll, pitch, -stretch * length2.sqrt()])
 
 
-def joint_forces(axes: Tensor, arm: Tensor, force: Tensor) -> Tensor:
+def joint_forces(pitch_axis: Tensor, knee_axis: Tensor, arm: Tensor, force: Tensor) -> Tensor:
     r"""Joint forces of a massless leg that carries `force` at its contact, tau = -J^T f.
 
-    The columns of J are a x arm for a hinge of axis a, with arm from the hip to the contact, and a for the knee's slide.
+    The columns of J are a x arm for a hinge of axis a, with arm from the hip to the contact, and the axis itself for a slide.
 
     Args:
-        axes: (roll, pitch, knee) (..., 3 joints, 3).
-        arm: hip to contact [m], (..., 3).
-        force: of the ground on the foot [N], (..., 3).
+        pitch_axis: of hip pitch, (3, ...); that of hip roll is x.
+        knee_axis: of the knee's slide, (3, ...).
+        arm: hip to contact [m], (3, ...).
+        force: of the ground on the foot [N], (3, ...).
 
     Returns:
-        (roll, pitch, knee) [N m, N m, N], (..., 3).
+        (roll, pitch, knee) [N m, N m, N], (3, ...).
     """
-    moment = torch.linalg.cross(arm, force)
-    return -(axes * torch.stack([moment, moment, force], dim=-2)).sum(-1)
+    moment = cross(arm, force)
+    return -torch.stack([moment[0], (pitch_axis * moment).sum(0), (knee_axis * force).sum(0)])
 
 
-def leg_frames(roll: Tensor, pitch: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the orientations Rx(roll) of the hip link and Rx(roll) Ry(pitch) of the leg in the trunk, each (..., 3, 3)."""
-    (sr, cr), (sp, cp) = (roll.sin(), roll.cos()), (pitch.sin(), pitch.cos())
-    zero, one = torch.zeros_like(roll), torch.ones_like(roll)
-    hip = torch.stack([one, zero, zero, zero, cr, -sr, zero, sr, cr], dim=-1)
-    leg = torch.stack([cp, zero, sp, sr * sp, cr, -sr * cp, -cr * sp, sr, cr * cp], dim=-1)
-    return hip.unflatten(-1, (3, 3)), leg.unflatten(-1, (3, 3))
+def cross(a: Tensor, b: Tensor) -> Tensor:
+    """Return a x b, components first, (3, ...)."""
+    (ax, ay, az), (bx, by, bz) = a, b
+    return torch.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
 def rotate(frame: Tensor, vec: Tensor) -> Tensor:
-    """Return R v for matrices R (..., 3, 3) and vectors v (..., 3)."""
-    return (frame * vec.unsqueeze(-2)).sum(-1)
+    """Return R v, components first: R (3, 3, ...), v (3, ...)."""
+    return (frame * vec).sum(1)
 
 
 def rotate_back(frame: Tensor, vec: Tensor) -> Tensor:
-    """Return R^T v for matrices R (..., 3, 3) and vectors v (..., 3)."""
-    return (frame * vec.unsqueeze(-1)).sum(-2)
+    """Return R^T v, components first: R (3, 3, ...), v (3, ...)."""
+    return (frame * vec[:, None]).sum(0)
+
+
+@dataclass(frozen=True)
+class Inertial:
+    """Mass [kg], centre of mass [m] and inertia about it [kg m^2] of bodies that move as one."""
+
+    mass: float
+    com: NDArray[np.float64]
+    inertia: NDArray[np.float64]
+
+    @staticmethod
+    def of(model: mujoco.MjModel, data: mujoco.MjData, bodies: NDArray[np.int_]) -> "Inertial":
+        """Take the bodies together in the model's present pose."""
+        mass = model.body_mass[bodies]
+        com = mass @ data.xipos[bodies] / mass.sum()
+        inertia = np.zeros((3, 3))
+        for body, m in zip(bodies, mass, strict=True):
+            frame = data.ximat[body].reshape(3, 3)
+            inertia += frame @ np.diag(model.body_inertia[body]) @ frame.T + _point(m, data.xipos[body] - com)
+        return Inertial(float(mass.sum()), com, inertia)
+
+    def about_origin(self) -> NDArray[np.float64]:
+        """Return the inertia about the origin (parallel axes)."""
+        return self.inertia + _point(self.mass, self.com)
+
+
+def _point(mass: float, pos: NDArray[np.float64]) -> NDArray[np.float64]:
+    return mass * (pos @ pos * np.eye(3) - np.outer(pos, pos))
 
 
 def _link(model: mujoco.MjModel, body: int) -> int:
@@ -195,28 +229,25 @@ def _link(model: mujoco.MjModel, body: int) -> int:
     return -1
 
 
-def _inertial(data: mujoco.MjData, model: mujoco.MjModel, bodies: NDArray[np.int_]) -> tuple[float, NDArray, NDArray]:
-    """Return mass, centre of mass and inertia about it of bodies that move as one, in the model's present pose."""
-    mass = model.body_mass[bodies]
-    com = mass @ data.xipos[bodies] / mass.sum()
-    inertia = np.zeros((3, 3))
-    for body, m in zip(bodies, mass, strict=True):
-        frame, offset = data.ximat[body].reshape(3, 3), data.xipos[body] - com
-        inertia += frame @ np.diag(model.body_inertia[body]) @ frame.T
-        inertia += m * (offset @ offset * np.eye(3) - np.outer(offset, offset))
-    return float(mass.sum()), com, inertia
-
-
-def _check_legs(robot: Robot, data: mujoco.MjData, hip: NDArray, foot: NDArray) -> None:
+def _check_legs(
+    robot: Robot, data: mujoco.MjData, hip: NDArray, foot: NDArray, right: list[Inertial], left: list[Inertial]
+) -> None:
+    """Raise if the legs are not mirror images of each other, built from rods and round hip links along the right axes."""
     joints = [robot.model.joint(name).id for name in JOINTS]
+    inertia = [link.inertia for link in (*right, *left)]
     as_expected = (
         np.allclose(data.xaxis[joints], np.concatenate([np.eye(3)] * 2))
         and np.allclose(data.xanchor[joints][[1, 4]], hip)
-        and np.allclose((foot - hip)[:, :2], 0.0)
         and np.allclose(hip[0], hip[1] * [1, -1, 1])
+        and np.allclose((foot - hip)[:, :2], 0.0)
+        and all(np.allclose((link.com - hip[side])[:2], 0.0) for side in (0, 1) for link in (right, left)[side])
+        and all(np.allclose(link.com, hip[side]) for side, link in enumerate((right[0], left[0])))
+        and all(np.allclose(i, np.diag(np.diag(i)), atol=1e-9) for i in inertia)
+        and all(np.isclose(i[1, 1], i[j, j]) for i, j in zip(inertia, (2, 0, 0) * 2, strict=True))
+        and all(np.isclose(a.mass, b.mass) and np.allclose(a.inertia, b.inertia) for a, b in zip(right, left, strict=True))
     )
     if not as_expected:
         raise UserError(
-            f"{robot.path}: the model-based walkers need legs of hip roll (x), hip pitch (y) through the same point, "
-            "and a knee along the leg (z) above the foot"
+            f"{robot.path}: the model-based walkers need two like legs of hip roll (x), hip pitch (y) through the same point, "
+            "and a knee along the leg (z), with the foot and all mass on the leg's axis"
         )

@@ -13,9 +13,9 @@ from telebip.control.config import WalkerConfig
 class Hold:
     """How a position actuator turns a target, held for one policy step, into a force: kp (q_target - q) - kv q'."""
 
-    stiffness: Tensor  # kp of (roll, pitch, knee) [N m/rad | N/m], (3,)
-    damping: Tensor  # kv [N m s/rad | N s/m], (3,)
-    limit: Tensor  # [N m | N], (3,)
+    stiffness: Tensor  # kp of (roll, pitch, knee) [N m/rad | N/m], (3, 1)
+    damping: Tensor  # kv [N m s/rad | N s/m], (3, 1)
+    limit: Tensor  # [N m | N], (3, 1)
     step_dt: float  # [s]
 
     def target(self, pos: Tensor, vel: Tensor, force: Tensor) -> Tensor:
@@ -38,21 +38,21 @@ def swing_path(start: Tensor, target: Tensor, phase: Tensor, cfg: WalkerConfig) 
         z = h sin(pi sigma) - d sigma^3 + z_start (1 - f)
 
     Args:
-        start: foot at lift-off: (x, y) from the centre of mass, z over the stance foot [m], (num_envs, 3).
-        target: touch-down (x, y) from the centre of mass [m], (num_envs, 2).
+        start: foot at lift-off: (x, y) from the centre of mass, z over the stance foot [m], (3, num_envs).
+        target: touch-down (x, y) from the centre of mass [m], (2, num_envs).
         phase: sigma, fraction of the step that has passed, (num_envs,).
         cfg: h is `swing_height`, d `swing_press`, a `swing_arrival`, and the step lasts `step_time`.
 
     Returns:
-        Position as `start` [m] and velocity [m/s], (num_envs, 3) each.
+        Position as `start` [m] and velocity [m/s], (3, num_envs) each.
     """
     a, h, d = cfg.swing_arrival, cfg.swing_height, cfg.swing_press
     angle = math.pi / a * phase.clamp(max=a)
     f, f_rate = 0.5 - 0.5 * angle.cos(), 0.5 * math.pi / a * angle.sin()
-    path = torch.cat([target, torch.zeros_like(start[:, 2:])], dim=1) - start
-    pos, vel = start + f[:, None] * path, f_rate[:, None] * path
-    pos[:, 2] += h * torch.sin(math.pi * phase) - d * phase**3
-    vel[:, 2] += math.pi * h * torch.cos(math.pi * phase) - 3.0 * d * phase**2
+    path = torch.cat([target - start[:2], -start[2:]])
+    pos, vel = start + f * path, f_rate * path
+    pos[2] += h * torch.sin(math.pi * phase) - d * phase**3
+    vel[2] += math.pi * h * torch.cos(math.pi * phase) - 3.0 * d * phase**2
     return pos, vel / cfg.step_time
 
 
@@ -67,22 +67,22 @@ def stance_force(
     With M = 0 the force points from the contact to the centre of mass, (x, y, H) from it; the rest turns the trunk.
 
     Args:
-        arm: contact to centre of mass, (x, y, H) [m], (num_envs, 3).
-        up: e, the trunk's z axis [-], (num_envs, 3).
-        rate: w, angular velocity of the trunk [rad/s], (num_envs, 3).
-        hip: height h of the hips over the contact and its rate h' [m, m/s], (num_envs, 2).
+        arm: contact to centre of mass, (x, y, H) [m], (3, num_envs).
+        up: e, the trunk's z axis [-], (3, num_envs).
+        rate: w, angular velocity of the trunk [rad/s], (3, num_envs).
+        hip: height h of the hips over the contact and its rate h' [m, m/s], (2, num_envs).
         weight: m g [N].
         friction: mu, sliding friction of the ground [-].
         cfg: the stance leg's gains and bounds.
 
     Returns:
-        f [N], (num_envs, 3), with f_z within `force_range` and the horizontal parts within `friction_use` mu f_z.
+        f [N], (3, num_envs), with f_z within `force_range` and the horizontal parts within `friction_use` mu f_z.
     """
     low, high = cfg.force_range
-    lift = cfg.height_stiffness * (cfg.hip_height - hip[:, 0]) - cfg.height_damping * hip[:, 1]
+    lift = cfg.height_stiffness * (cfg.hip_height - hip[0]) - cfg.height_damping * hip[1]
     f_z = (weight + lift).clamp(low * weight, high * weight)
-    m_x = cfg.trunk_stiffness * up[:, 1] - cfg.trunk_damping * rate[:, 0]
-    m_y = -cfg.trunk_stiffness * up[:, 0] - cfg.trunk_damping * rate[:, 1]
-    horizontal = (arm[:, :2] * f_z[:, None] + torch.stack([-m_y, m_x], dim=1)) / arm[:, 2:]
-    bound = (cfg.friction_use * friction * f_z)[:, None]
-    return torch.cat([torch.minimum(torch.maximum(horizontal, -bound), bound), f_z[:, None]], dim=1)
+    m_x = cfg.trunk_stiffness * up[1] - cfg.trunk_damping * rate[0]
+    m_y = -cfg.trunk_stiffness * up[0] - cfg.trunk_damping * rate[1]
+    horizontal = (arm[:2] * f_z + torch.stack([-m_y, m_x])) / arm[2]
+    bound = cfg.friction_use * friction * f_z
+    return torch.cat([torch.minimum(torch.maximum(horizontal, -bound), bound), f_z[None]])

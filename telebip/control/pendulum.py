@@ -14,14 +14,14 @@ class Pendulum:
     mass: float  # m [kg]
     height: Tensor  # H, centre of mass above the contact [m], (num_envs,)
     rate: Tensor  # w = sqrt(g / H) [1/s], (num_envs,)
-    pos: Tensor  # (x, y), centre of mass minus contact [m], (num_envs, 2)
-    vel: Tensor  # (v_x, v_y) of the centre of mass [m/s], (num_envs, 2)
-    ang_mom: Tensor  # (L_x, L_y) about the contact [kg m^2/s], (num_envs, 2)
+    pos: Tensor  # (x, y), centre of mass minus contact [m], (2, num_envs)
+    vel: Tensor  # (v_x, v_y) of the centre of mass [m/s], (2, num_envs)
+    ang_mom: Tensor  # (L_x, L_y) about the contact [kg m^2/s], (2, num_envs)
 
     def pos_after(self, time: Tensor) -> Tensor:
-        """Return (x, y) after `time` [s] (num_envs,): x cosh(w t) + (v_x / w) sinh(w t), likewise y; (num_envs, 2)."""
+        """Return (x, y) after `time` [s] (num_envs,): x cosh(w t) + (v_x / w) sinh(w t), likewise y; (2, num_envs)."""
         angle = self.rate * time
-        return self.pos * angle.cosh()[:, None] + self.vel * (angle.sinh() / self.rate)[:, None]
+        return self.pos * angle.cosh() + self.vel * (angle.sinh() / self.rate)
 
 
 @dataclass(frozen=True)
@@ -30,13 +30,13 @@ class Step:
 
     side: Tensor  # s, +1 in left stance and -1 in right stance, (num_envs,)
     time_left: Tensor  # r, until touch-down [s], (num_envs,)
-    velocity: Tensor  # wanted (v_x, v_y) [m/s], (num_envs, 2)
+    velocity: Tensor  # wanted (v_x, v_y) [m/s], (2, num_envs)
     time: float  # T, of every step [s]
     width: float  # W, lateral distance of the feet when walking in place [m]
 
 
 Placement = Callable[[Pendulum, Step], Tensor]
-"""A foot placement law: where to touch down, relative to the centre of mass at that time [m], (num_envs, 2)."""
+"""A foot placement law: where to touch down, relative to the centre of mass at that time [m], (2, num_envs)."""
 
 
 def mean_to_end_speed(rate: Tensor, time: float) -> Tensor:

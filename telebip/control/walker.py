@@ -3,7 +3,7 @@
 Once per policy step a walker reads the robot's state from the observation, reduces it to an inverted pendulum about the stance
 contact, asks its placement law where to touch down, and turns the swing leg's path and the stance leg's force into joint
 targets. The plan frame has its origin in the trunk, z up and x along the heading, low-passed: the heading itself wobbles within
-a step and would shake the placement.
+a step and would shake the placement. Tensors have worlds last, see `telebip.control.kinematics`.
 """
 
 from dataclasses import dataclass
@@ -13,10 +13,10 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from telebip.control.config import WalkerConfig
-from telebip.control.kinematics import Kinematics, Motion, joint_forces, rotate, rotate_back
+from telebip.control.kinematics import Kinematics, Motion, cross, joint_forces, rotate, rotate_back
 from telebip.control.legs import Hold, stance_force, swing_path
 from telebip.control.pendulum import Pendulum, Placement, Step
-from telebip.math import matrix, quat_from_yaw, quat_mul, wrap_angle, yaw
+from telebip.math import matrix, wrap_angle
 from telebip.mdp.observations import LAYOUT
 
 
@@ -25,16 +25,16 @@ class Body:
     """One observation of all worlds, as the walker sees it. Plan frame unless noted; legs right, left."""
 
     motion: Motion  # trunk frame
-    to_plan: Tensor  # rotation from the trunk to the plan frame, (num_envs, 3, 3)
-    ang_vel: Tensor  # of the trunk, trunk frame [rad/s], (num_envs, 3)
-    hip_vel: Tensor  # of the trunk's origin, midway between the hips [m/s], (num_envs, 3)
-    com: Tensor  # from the trunk's origin [m], (num_envs, 3)
-    com_vel: Tensor  # [m/s], (num_envs, 3)
-    ang_mom: Tensor  # centroidal [kg m^2/s], (num_envs, 3)
-    foot: Tensor  # contact points under the feet, from the trunk's origin [m], (num_envs, 2, 3)
-    joint_pos: Tensor  # [rad | m], (num_envs, 2, 3)
-    joint_vel: Tensor  # [rad/s | m/s], (num_envs, 2, 3)
-    command: Tensor  # (v_x, v_y) [m/s], (num_envs, 2)
+    to_plan: Tensor  # rotation from the trunk to the plan frame, (3, 3, num_envs)
+    ang_vel: Tensor  # of the trunk, trunk frame [rad/s], (3, num_envs)
+    hip_vel: Tensor  # of the trunk's origin, midway between the hips [m/s], (3, num_envs)
+    com: Tensor  # from the trunk's origin [m], (3, num_envs)
+    com_vel: Tensor  # [m/s], (3, num_envs)
+    ang_mom: Tensor  # centroidal [kg m^2/s], (3, num_envs)
+    foot: Tensor  # contact points under the feet, from the trunk's origin [m], (3, 2, num_envs)
+    joint_pos: Tensor  # [rad | m], (3, 2, num_envs)
+    joint_vel: Tensor  # [rad/s | m/s], (3, 2, num_envs)
+    command: Tensor  # (v_x, v_y) [m/s], (2, num_envs)
     heading: Tensor  # relative to the reference heading [rad], (num_envs,)
 
 
@@ -64,10 +64,10 @@ class Walker:
         """
         self.cfg, self.place, self.kinematics, self.step_dt = cfg, place, kinematics, step_dt
         self.hold = Hold(kinematics.stiffness, kinematics.damping, kinematics.force_limit, step_dt)
-        self._nominal, self._action_scale = nominal, action_scale
+        self._nominal, self._action_scale = nominal[:, None], action_scale[:, None]
 
         def zeros(*shape: int) -> Tensor:
-            return torch.zeros(num_envs, *shape, device=nominal.device)
+            return torch.zeros(*shape, num_envs, device=nominal.device)
 
         self._is_new = torch.ones(num_envs, dtype=torch.bool, device=nominal.device)
         self._heading = zeros()  # of the plan frame, relative to the reference heading [rad]
@@ -85,7 +85,7 @@ class Walker:
 
     def __call__(self, obs: TensorDict) -> Tensor:
         """See `Policy`."""
-        body = self._observe(obs["policy"])
+        body = self._observe(obs["policy"].T)
         self._begin_steps(body)
         stance_foot, _ = self._stance_and_swing(body.foot)
         (stance_pos, swing_pos), (stance_vel, swing_vel) = map(self._stance_and_swing, (body.joint_pos, body.joint_vel))
@@ -94,40 +94,44 @@ class Walker:
         swing_target = self._swing_target(body, arm, self._touch_down(body, arm))
         swing_force = self.hold.force(swing_target, swing_pos, swing_vel)
         stance_joint_force = self._stance_joint_force(body, arm, stance_foot)
-        stance_joint_force[:, :2] -= swing_force[:, :2]  # what moves the swing leg at its hip turns the trunk back
+        stance_joint_force[:2] -= swing_force[:2]  # what moves the swing leg at its hip turns the trunk back
         stance_target = self.hold.target(stance_pos, stance_vel, stance_joint_force)
         self._advance(body)
 
-        left_stands = (self._side > 0.0)[:, None]
+        left_stands = self._side > 0.0
         right = torch.where(left_stands, swing_target, stance_target)
         left = torch.where(left_stands, stance_target, swing_target)
-        low, high = self.kinematics.joint_range.unbind(-1)
-        target = torch.cat([right, left], dim=1).clamp(low, high)
-        return (target - self._nominal) / self._action_scale
+        low, high = self.kinematics.joint_range.unbind(1)
+        target = torch.clamp(torch.cat([right, left]), low, high)
+        return ((target - self._nominal) / self._action_scale).T
 
     def _observe(self, obs: Tensor) -> Body:
-        """Read the observation, and bring the plan frame's heading up to date."""
-        part = dict(zip(LAYOUT, obs.split(list(LAYOUT.values()), dim=1), strict=True))
-        heading = yaw(part["base_quat"])
+        """Read observations (33, num_envs), and bring the plan frame's heading up to date."""
+        part = dict(zip(LAYOUT, obs.split(list(LAYOUT.values())), strict=True))
+        frame = matrix(part["base_quat"].T).permute(1, 2, 0).contiguous()
+        heading = torch.atan2(frame[1, 0], frame[0, 0])
         change = (self.step_dt / self.cfg.heading_filter) * wrap_angle(heading - self._heading)
         self._heading.copy_(torch.where(self._is_new, heading, wrap_angle(self._heading + change)))
-        to_plan = matrix(quat_mul(quat_from_yaw(-self._heading), part["base_quat"]))
-        joint_pos, joint_vel, ang_vel = part["joint_pos"] + self._nominal, part["joint_vel"], part["base_ang_vel"]
+        cos, sin = self._heading.cos(), self._heading.sin()
+        to_plan = torch.stack([cos * frame[0] + sin * frame[1], cos * frame[1] - sin * frame[0], frame[2]])
+        joint_pos, joint_vel = part["joint_pos"] + self._nominal, part["joint_vel"].contiguous()
+        joint_pos, joint_vel = (joints.unflatten(0, (2, 3)).transpose(0, 1) for joints in (joint_pos, joint_vel))
+        ang_vel, hip_vel = part["base_ang_vel"].contiguous(), rotate(to_plan, part["base_lin_vel"])
         motion = self.kinematics(joint_pos, joint_vel, ang_vel)
-        foot = rotate(to_plan[:, None], self.kinematics.hip + motion.leg)
-        foot[..., 2] -= self.kinematics.foot_radius
+        foot = rotate(to_plan[:, :, None], self.kinematics.hip + motion.leg)
+        foot[2] -= self.kinematics.foot_radius
         return Body(
             motion=motion,
             to_plan=to_plan,
             ang_vel=ang_vel,
-            hip_vel=rotate(to_plan, part["base_lin_vel"]),
+            hip_vel=hip_vel,
             com=rotate(to_plan, motion.com),
-            com_vel=rotate(to_plan, motion.com_vel + part["base_lin_vel"]),
+            com_vel=rotate(to_plan, motion.com_vel) + hip_vel,
             ang_mom=rotate(to_plan, motion.ang_mom),
             foot=foot,
-            joint_pos=joint_pos.unflatten(1, (2, 3)),
-            joint_vel=joint_vel.unflatten(1, (2, 3)),
-            command=part["command"][:, :2],
+            joint_pos=joint_pos,
+            joint_vel=joint_vel,
+            command=part["command"][:2],
             heading=heading,
         )
 
@@ -136,85 +140,83 @@ class Walker:
         cfg, new = self.cfg, self._is_new
         over = (self._phase >= 1.0 - 1e-4) & ~new
         self._phase.copy_(torch.where(new, cfg.start_phase, self._phase - over.float()))
-        sway = torch.where(body.com_vel[:, 1] > 0.0, 1.0, -1.0)
+        sway = torch.where(body.com_vel[1] > 0.0, 1.0, -1.0)
         self._side.copy_(torch.where(new, sway, torch.where(over, -self._side, self._side)))
 
         most = cfg.acceleration * self.step_dt
         velocity = self._velocity + (body.command - self._velocity).clamp(-most, most)
-        self._velocity.copy_(torch.where(new[:, None], body.com_vel[:, :2], velocity))
+        self._velocity.copy_(torch.where(new, body.com_vel[:2], velocity))
 
         # The integral of the speed error, once per step, but not while the robot is still gathering speed.
-        error = self._velocity - self._path / self._elapsed.clamp(min=self.step_dt)[:, None]
+        error = self._velocity - self._path / self._elapsed.clamp(min=self.step_dt)
         speed = (self._speed + cfg.speed_gain * error).clamp(-cfg.speed_limit, cfg.speed_limit)
-        counts = over[:, None] & (self._velocity == body.command)
-        self._speed.copy_(torch.where(counts, speed, self._speed).masked_fill(new[:, None], 0.0))
+        counts = over & (self._velocity == body.command)
+        self._speed.copy_(torch.where(counts, speed, self._speed).masked_fill(new, 0.0))
 
-        begin = (over | new)[:, None]
+        begin = over | new
         stance_foot, swing_foot = self._stance_and_swing(body.foot)
-        lift_off = torch.cat([swing_foot[:, :2] - body.com[:, :2], (swing_foot - stance_foot)[:, 2:]], dim=1)
+        lift_off = torch.cat([swing_foot[:2] - body.com[:2], (swing_foot - stance_foot)[2:]])
         self._lift_off.copy_(torch.where(begin, lift_off, self._lift_off))
         self._path.masked_fill_(begin, 0.0)
-        self._elapsed.masked_fill_(begin[:, 0], 0.0)
+        self._elapsed.masked_fill_(begin, 0.0)
         self._is_new.zero_()
 
     def _advance(self, body: Body) -> None:
         """Let the time of one policy step pass."""
         self._phase += self.step_dt / self.cfg.step_time
         self._elapsed += self.step_dt
-        self._path += self.step_dt * body.com_vel[:, :2]
+        self._path += self.step_dt * body.com_vel[:2]
 
     def _touch_down(self, body: Body, arm: Tensor) -> Tensor:
-        """Where the swing foot should touch down, relative to the centre of mass then [m], (num_envs, 2)."""
+        """Where the swing foot should touch down, relative to the centre of mass then [m], (2, num_envs)."""
         cfg, mass = self.cfg, self.kinematics.mass
-        height = arm[:, 2].clamp(min=0.1)  # finite answers to a robot that lies on the ground
-        (x, y, _), (v_x, v_y, v_z) = arm.unbind(1), body.com_vel.unbind(1)
-        orbital = mass * torch.stack([y * v_z - height * v_y, height * v_x - x * v_z], dim=1)
+        (x, y, height), (v_x, v_y, v_z) = arm, body.com_vel
+        height = height.clamp(min=0.1)  # finite answers to a robot that lies on the ground
+        orbital = mass * torch.stack([y * v_z - height * v_y, height * v_x - x * v_z])
         pendulum = Pendulum(
             mass=mass,
             height=height,
             rate=torch.sqrt(self.kinematics.gravity / height),
-            pos=arm[:, :2],
-            vel=body.com_vel[:, :2],
-            ang_mom=body.ang_mom[:, :2] + orbital,
+            pos=arm[:2],
+            vel=body.com_vel[:2],
+            ang_mom=body.ang_mom[:2] + orbital,
         )
         time_left = cfg.step_time * (1.0 - self._phase)
         step = Step(self._side, time_left, self._velocity + self._speed, cfg.step_time, cfg.step_width)
-        t_x, t_y = self.place(pendulum, step).unbind(1)
+        t_x, t_y = self.place(pendulum, step)
         # Without a hip yaw joint the robot turns by stepping further with one foot than with the other.
         t_x = t_x + self._side * (cfg.steering_gain * body.heading).clamp(-cfg.steering_limit, cfg.steering_limit)
         t_x, t_y = t_x.clamp(-cfg.reach, cfg.reach), t_y.clamp(-cfg.reach, cfg.reach)
         # The feet must not cross: the touch-down lies on the swing leg's side of the stance foot.
-        sway = pendulum.pos_after(time_left)[:, 1]
+        sway = pendulum.pos_after(time_left)[1]
         distance = (-self._side * (t_y + sway)).clamp(*cfg.feet_distance)
-        return torch.stack([t_x, -self._side * distance - sway], dim=1)
+        return torch.stack([t_x, -self._side * distance - sway])
 
     def _swing_target(self, body: Body, arm: Tensor, touch_down: Tensor) -> Tensor:
-        """Joint targets of the swing leg [rad | m], (num_envs, 3): its path in the middle of the coming policy step."""
+        """Joint targets of the swing leg [rad | m], (3, num_envs): its path in the middle of the coming policy step."""
         kin = self.kinematics
         phase = self._phase + 0.5 * self.step_dt / self.cfg.step_time
         pos, vel = swing_path(self._lift_off, touch_down, phase.clamp(max=1.0), self.cfg)
-        pos[:, 2] += kin.foot_radius - arm[:, 2]  # from height over the stance contact to foot centre from centre of mass
-        vel[:, 2] -= body.com_vel[:, 2]
+        pos[2] += kin.foot_radius - arm[2]  # from height over the stance contact to foot centre from centre of mass
+        vel[2] -= body.com_vel[2]
         foot = rotate_back(body.to_plan, pos) + body.motion.com  # from the trunk's origin, trunk frame
-        hip = torch.where(self._side[:, None] > 0.0, kin.hip[0], kin.hip[1])
-        foot_vel = rotate_back(body.to_plan, vel) + body.motion.com_vel - torch.linalg.cross(body.ang_vel, foot)
-        leg = foot - hip
+        foot_vel = rotate_back(body.to_plan, vel) + body.motion.com_vel - cross(body.ang_vel, foot)
+        leg = foot - torch.where(self._side > 0.0, kin.hip[:, 0], kin.hip[:, 1])
         return kin.inverse(leg) + kin.damping * kin.inverse_rate(leg, foot_vel) / kin.stiffness
 
     def _stance_joint_force(self, body: Body, arm: Tensor, stance_foot: Tensor) -> Tensor:
-        """Joint forces of the stance leg, as if the other one had no mass [N m | N], (num_envs, 3)."""
-        kin = self.kinematics
-        hip = torch.stack([-stance_foot[:, 2], body.hip_vel[:, 2]], dim=1)
+        """Joint forces of the stance leg, as if the other one had no mass [N m | N], (3, num_envs)."""
+        kin, motion = self.kinematics, body.motion
+        hip = torch.stack([-stance_foot[2], body.hip_vel[2]])
         rate = rotate(body.to_plan, body.ang_vel)
-        weight = kin.mass * kin.gravity
-        force = stance_force(arm, body.to_plan[:, :, 2], rate, hip, weight, kin.friction, self.cfg)
-        axes, _ = self._stance_and_swing(body.motion.axes)
-        leg, _ = self._stance_and_swing(body.motion.leg)
-        contact = leg - kin.foot_radius * body.to_plan[:, 2]  # the point under the foot's centre, trunk frame
-        return joint_forces(axes, contact, rotate_back(body.to_plan, force))
+        force = stance_force(arm, body.to_plan[:, 2], rate, hip, kin.mass * kin.gravity, kin.friction, self.cfg)
+        leg, pitch_axis, knee_axis = (
+            self._stance_and_swing(legs)[0] for legs in (motion.leg, motion.pitch_axis, motion.knee_axis)
+        )
+        contact = leg - kin.foot_radius * body.to_plan[2]  # the point under the foot's centre, trunk frame
+        return joint_forces(pitch_axis, knee_axis, contact, rotate_back(body.to_plan, force))
 
     def _stance_and_swing(self, legs: Tensor) -> tuple[Tensor, Tensor]:
-        """Split (num_envs, 2, ...), right and left, into that of the stance leg and that of the swing leg."""
-        right, left = legs.unbind(1)
-        left_stands = (self._side > 0.0).view(-1, *[1] * (right.dim() - 1))
+        """Split (3, 2, num_envs), right and left, into that of the stance leg and that of the swing leg."""
+        left_stands, right, left = self._side > 0.0, legs[:, 0], legs[:, 1]
         return torch.where(left_stands, left, right), torch.where(left_stands, right, left)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from telebip import ROOT
-from telebip.control.kinematics import Kinematics, Motion, joint_forces, leg_frames, rotate, rotate_back
+from telebip.control.kinematics import Kinematics, Motion, cross, joint_forces, rotate, rotate_back
 from telebip.errors import UserError
 from telebip.robot import Robot, load_robot
 
@@ -43,20 +43,26 @@ def states(robot: Robot) -> list[tuple[mujoco.MjData, NDArray[np.float64]]]:
 @pytest.fixture(scope="module")
 def motion(kinematics: Kinematics, states) -> Motion:
     qpos, qvel = (tensor([getattr(data, name) for data, _ in states]) for name in ("qpos", "qvel"))
-    return kinematics(qpos[:, 7:], qvel[:, 6:], qvel[:, 3:6])
+    return kinematics(legs(qpos[7:]), legs(qvel[6:]), qvel[3:6])
 
 
 def tensor(rows) -> Tensor:
-    return torch.tensor(np.array(rows), dtype=torch.float32)
+    """Rows of worlds as a tensor with the worlds last."""
+    return torch.tensor(np.array(rows), dtype=torch.float32).T
+
+
+def legs(joints: Tensor) -> Tensor:
+    """(6, worlds) as (3, 2 legs, worlds)."""
+    return joints.unflatten(0, (2, 3)).transpose(0, 1)
 
 
 def test_masses_and_lengths_come_from_the_model(kinematics: Kinematics) -> None:
     assert kinematics.mass == pytest.approx(13.6)
     assert (kinematics.gravity, kinematics.friction) == (pytest.approx(9.81), pytest.approx(0.8))
     assert (kinematics.leg_length, kinematics.foot_radius) == (pytest.approx(0.67), pytest.approx(0.03))
-    torch.testing.assert_close(kinematics.hip, torch.tensor([[0.0, -0.1, 0.0], [0.0, 0.1, 0.0]]))
-    assert kinematics.stiffness.tolist() == [200.0, 200.0, 6000.0]
-    assert kinematics.damping.tolist() == [6.0, 6.0, 200.0]
+    torch.testing.assert_close(kinematics.hip[..., 0], torch.tensor([[0.0, 0.0], [-0.1, 0.1], [0.0, 0.0]]))
+    assert kinematics.stiffness[:, 0].tolist() == [200.0, 200.0, 6000.0]
+    assert kinematics.damping[:, 0].tolist() == [6.0, 6.0, 200.0]
 
 
 def test_centre_of_mass_and_its_velocity(robot: Robot, states, motion: Motion) -> None:
@@ -85,20 +91,20 @@ def test_legs_reach_from_hip_to_foot(robot: Robot, states, motion: Motion) -> No
 def test_joint_forces_are_minus_jacobian_transposed_times_force(
     robot: Robot, states, motion: Motion, side: int, foot: str
 ) -> None:
-    force = torch.randn(WORLDS, 3, generator=torch.Generator().manual_seed(1)) * 100.0
+    force = torch.randn(3, WORLDS, generator=torch.Generator().manual_seed(1)) * 100.0
     offset = np.array([0.01, -0.02, -0.03])  # from the foot's centre, trunk frame
     expected = []
-    for (data, frame), f in zip(states, force.double().numpy(), strict=True):
+    for (data, frame), f in zip(states, force.T.double().numpy(), strict=True):
         jacobian = np.empty((3, 12))
         point = data.site(foot).xpos + frame @ offset
         mujoco.mj_jac(robot.model, data, jacobian, None, point, robot.model.body(foot).id)
         expected.append(-jacobian[:, 6 + 3 * side : 9 + 3 * side].T @ frame @ f)
-    forces = joint_forces(motion.axes[:, side], motion.leg[:, side] + tensor(offset), force)
+    forces = joint_forces(motion.pitch_axis[:, side], motion.knee_axis[:, side], motion.leg[:, side] + tensor([offset]), force)
     torch.testing.assert_close(forces, tensor(expected), atol=1e-3, rtol=1e-5)
 
 
 def test_inverse_kinematics_round_trip(kinematics: Kinematics, states, motion: Motion) -> None:
-    joints = tensor([data.qpos[7:] for data, _ in states]).unflatten(1, (2, 3))
+    joints = legs(tensor([data.qpos[7:] for data, _ in states]))
     torch.testing.assert_close(kinematics.inverse(motion.leg), joints, atol=1e-5, rtol=0.0)
 
 
@@ -126,10 +132,12 @@ def test_inverse_rate_undoes_the_jacobian(robot: Robot, kinematics: Kinematics, 
         torch.testing.assert_close(rate, joint_vel, atol=2e-5, rtol=1e-4)
 
 
-def test_rotations() -> None:
-    hip, leg = leg_frames(torch.tensor(0.3), torch.tensor(-0.5))
-    torch.testing.assert_close(rotate(leg, rotate_back(leg, torch.tensor([1.0, 2.0, 3.0]))), torch.tensor([1.0, 2.0, 3.0]))
-    torch.testing.assert_close(rotate(hip, torch.tensor([1.0, 0.0, 0.0])), torch.tensor([1.0, 0.0, 0.0]))
+def test_rotations_and_the_cross_product() -> None:
+    a, b = torch.randn(2, 3, 5, generator=torch.Generator().manual_seed(2))
+    torch.testing.assert_close(cross(a, b), torch.linalg.cross(a, b, dim=0))
+    quarter = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])[:, :, None]  # x to y, y to -x
+    torch.testing.assert_close(rotate(quarter, a), torch.stack([-a[1], a[0], a[2]]))
+    torch.testing.assert_close(rotate_back(quarter, rotate(quarter, a)), a)
 
 
 @pytest.mark.parametrize(
@@ -138,6 +146,11 @@ def test_rotations() -> None:
         ('<joint name="right_hip_pitch" class="hip_pitch"/>', '<joint name="right_hip_pitch" class="hip_pitch" axis="0 0 1"/>'),
         ('<joint name="left_hip_pitch" class="hip_pitch"/>', '<joint name="left_hip_pitch" class="hip_pitch" pos="0 0 0.1"/>'),
         ('<body name="right_shank" pos="0 0 -0.67">', '<body name="right_shank" pos="0.05 0 -0.67">'),
+        ('size="0.03 0.18" pos="0 0 -0.18"', 'size="0.03 0.18" pos="0.01 0 -0.18"'),  # the thighs' mass in front of the axis
+        (
+            '<geom name="left_shank" type="cylinder" size="0.018 0.225" pos="0 0 0.225" mass="0.3"',
+            '<geom name="left_shank" type="cylinder" size="0.018 0.225" pos="0 0 0.225" mass="0.4"',
+        ),
     ],
 )
 def test_other_legs_are_refused(tmp_path: Path, before: str, after: str) -> None:
@@ -145,5 +158,5 @@ def test_other_legs_are_refused(tmp_path: Path, before: str, after: str) -> None
     assert before in text
     path = tmp_path / "robot.xml"
     path.write_text(text.replace(before, after))
-    with pytest.raises(UserError, match=r"robot\.xml: the model-based walkers need legs of hip roll"):
+    with pytest.raises(UserError, match=r"robot\.xml: the model-based walkers need two like legs of hip roll"):
         Kinematics(load_robot(path), torch.device("cpu"))

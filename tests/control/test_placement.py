@@ -18,14 +18,14 @@ LAWS = pytest.mark.parametrize("place", [alip.foot_placement, dcm.foot_placement
 
 def pendulum(pos: Tensor, vel: Tensor) -> Pendulum:
     """A point mass at constant height: its angular momentum about the contact is m H times its velocity."""
-    ones = torch.ones(len(pos), dtype=torch.float64)
-    ang_mom = MASS * HEIGHT * torch.stack([-vel[:, 1], vel[:, 0]], dim=1)
+    ones = torch.ones_like(pos[0])
+    ang_mom = MASS * HEIGHT * torch.stack([-vel[1], vel[0]])
     return Pendulum(MASS, HEIGHT * ones, RATE * ones, pos, vel, ang_mom)
 
 
 def step(side: Tensor, time_left: float, velocity: tuple[float, float]) -> Step:
     ones = torch.ones_like(side)
-    return Step(side, time_left * ones, torch.tensor(velocity, dtype=torch.float64).expand(len(side), 2), TIME, WIDTH)
+    return Step(side, time_left * ones, torch.tensor(velocity, dtype=torch.float64)[:, None].expand(2, len(side)), TIME, WIDTH)
 
 
 def integrate(pos: Tensor, vel: Tensor, time: float, steps: int = 400) -> tuple[Tensor, Tensor]:
@@ -48,7 +48,7 @@ def integrate(pos: Tensor, vel: Tensor, time: float, steps: int = 400) -> tuple[
 @pytest.fixture
 def start() -> tuple[Tensor, Tensor]:
     generator = torch.Generator().manual_seed(0)
-    return 0.1 * torch.randn(8, 2, generator=generator).double(), 0.5 * torch.randn(8, 2, generator=generator).double()
+    return 0.1 * torch.randn(2, 8, generator=generator).double(), 0.5 * torch.randn(2, 8, generator=generator).double()
 
 
 def after(predict: Callable[[Pendulum, Tensor], Tensor], start: tuple[Tensor, Tensor], time: float) -> Tensor:
@@ -59,19 +59,19 @@ def after(predict: Callable[[Pendulum, Tensor], Tensor], start: tuple[Tensor, Te
 def test_predictions_agree_with_integration(start: tuple[Tensor, Tensor], time: float) -> None:
     pos, vel = integrate(*start, time)
     torch.testing.assert_close(after(Pendulum.pos_after, start, time), pos)
-    ang_mom = MASS * HEIGHT * torch.stack([-vel[:, 1], vel[:, 0]], dim=1)
+    ang_mom = MASS * HEIGHT * torch.stack([-vel[1], vel[0]])
     torch.testing.assert_close(after(alip.predict_ang_mom, start, time), ang_mom)
     torch.testing.assert_close(after(dcm.predict_dcm, start, time), pos + vel / RATE)
 
 
 def orbit(side: float, velocity: tuple[float, float]) -> tuple[Tensor, Tensor]:
-    """State just after touch-down of the walk that repeats: x goes from -v T / 2 to v T / 2, y sways towards the foot and back."""
+    """State just after touch-down of the walk that repeats: x goes from -v T / 2 to v T / 2, y sways to the foot and back."""
     half = 0.5 * RATE * TIME
     x, y = (-0.5 * v * TIME for v in velocity)
     v_x, v_y = (v * half / math.tanh(half) for v in velocity)
     y = y - side * 0.5 * WIDTH  # the sway is symmetric in time about the middle of the step
     v_y = v_y + side * 0.5 * WIDTH * RATE * math.tanh(half)
-    return torch.tensor([[x, y]], dtype=torch.float64), torch.tensor([[v_x, v_y]], dtype=torch.float64)
+    return torch.tensor([[x], [y]], dtype=torch.float64), torch.tensor([[v_x], [v_y]], dtype=torch.float64)
 
 
 def walk(place: Placement, state: tuple[Tensor, Tensor], side: Tensor, velocity: tuple[float, float], steps: int):
@@ -98,7 +98,7 @@ def test_the_periodic_walk_repeats(place: Placement, side: float, velocity: tupl
         torch.testing.assert_close(pos, expected_pos, atol=1e-9, rtol=0.0)
         torch.testing.assert_close(vel, expected_vel, atol=1e-9, rtol=0.0)
         expected_way = [velocity[0] * TIME, velocity[1] * TIME + s * WIDTH]  # the left foot lands when the left stance begins
-        torch.testing.assert_close(way[0], torch.tensor(expected_way, dtype=torch.float64), atol=1e-9, rtol=0.0)
+        torch.testing.assert_close(way[:, 0], torch.tensor(expected_way, dtype=torch.float64), atol=1e-9, rtol=0.0)
 
 
 @LAWS
@@ -120,7 +120,7 @@ def test_a_disturbed_walk_returns(place: Placement, start: tuple[Tensor, Tensor]
 def test_placement_is_its_own_mirror_image(place: Placement, start: tuple[Tensor, Tensor]) -> None:
     side = torch.tensor([1.0, -1.0] * 4, dtype=torch.float64)
     pos, vel = start
-    flip = torch.tensor([1.0, -1.0], dtype=torch.float64)
+    flip = torch.tensor([[1.0], [-1.0]], dtype=torch.float64)
     contact = place(pendulum(pos, vel), step(side, 0.1, (0.7, 0.1)))
     mirrored = place(pendulum(pos * flip, vel * flip), step(-side, 0.1, (0.7, -0.1)))
     torch.testing.assert_close(mirrored, contact * flip)
