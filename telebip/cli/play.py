@@ -160,6 +160,7 @@ def _as_played(config: TaskConfig, options: argparse.Namespace) -> TaskConfig:
         f"num_envs={options.num_envs}",
         f"episode.length={options.duration + 1.0}",
         "episode.reset_heading=0",
+        "reward.extra={}",  # walking needs no rewards, and the functions need not be there
         *(f"disturbance.{name}.enabled={str(options.disturb).lower()}" for name in ("push", "friction", "noise")),
         *([] if options.seed is None else [f"seed={options.seed}"]),
         *options.overrides,
