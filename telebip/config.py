@@ -121,6 +121,7 @@ class RewardConfig:
     foot: FootRewardConfig = section(FootRewardConfig)
     energy: EnergyRewardConfig = section(EnergyRewardConfig)
     termination: TerminationRewardConfig = section(TerminationRewardConfig)
+    extra: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass
@@ -327,7 +328,7 @@ def _apply(config: DictConfig, leaves: list[Leaf], origins: dict[str, str]) -> N
         try:
             if "${" in str(value):
                 raise ValueError("OmegaConf would look the value up elsewhere")
-            OmegaConf.update(config, key, value)
+            OmegaConf.update(config, key, value, merge=False)
         except (OmegaConfBaseException, OverflowError, ValueError, TypeError) as error:
             raise UserError(f"{where}: {key}: {_describe(value)} is not {_type_name(schema)}") from error
         origins[key] = where
@@ -337,6 +338,9 @@ def _schema_of(schema: Any, key: str, where: str) -> Any:
     """Return the type of a dotted key, or raise the error that names the nearest valid one."""
     walked = ""
     for name in key.split("."):
+        if schema == dict[str, float]:  # names of the user's own
+            schema, walked = float, f"{walked}{name}."
+            continue
         fields = {f.name: f for f in dataclasses.fields(schema)} if dataclasses.is_dataclass(schema) else {}
         if name not in fields:
             raise UserError(
@@ -351,6 +355,8 @@ def _type_name(schema: Any) -> str:
     names = {float: "a number", int: "a whole number", bool: "true or false", str: "a text"}
     if schema in names:
         return names[schema]
+    if schema == dict[str, float]:
+        return "a mapping of names to numbers"
     text = str(schema)
     if "Literal" in text:
         return "one of " + ", ".join(schema.__args__)
@@ -400,7 +406,8 @@ def _values(node: Any, prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
         if dataclasses.is_dataclass(value):
             yield from _values(value, f"{prefix}{f.name}.")
         else:
-            yield f"{prefix}{f.name}", value, f.metadata
+            entries = value if isinstance(value, dict) else {"": value}
+            yield from ((f"{prefix}{f.name}.{name}".rstrip("."), entry, f.metadata) for name, entry in entries.items())
 
 
 def _shown(path: Path) -> str:

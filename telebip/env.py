@@ -14,7 +14,7 @@ from telebip.mdp.context import StepContext
 from telebip.mdp.curriculum import ramp
 from telebip.mdp.observations import heading_relative_quat, noise_amplitude, observation
 from telebip.mdp.randomization import initial_state, sample_pushes, uniform
-from telebip.mdp.rewards import REWARDS
+from telebip.mdp.rewards import reward_terms
 from telebip.robot import Robot
 from telebip.sim import Backend, make_simulator
 
@@ -49,6 +49,7 @@ class TelebipEnv(VecEnv):
         self.device: torch.device = torch.device(device)
         self.num_envs, self.num_actions = cfg.num_envs, 6
         self._keep_final_obs = keep_final_obs
+        self._rewards = reward_terms(cfg.reward)
         self.sim = make_simulator(backend, robot, self.num_envs, cfg.sim.decimation, self.device, ("geom_friction",))
         self.step_dt = cfg.sim.decimation * robot.physics_dt  # [s]
         self.max_episode_length: int = max(1, round(cfg.episode.length / self.step_dt))  # policy steps
@@ -154,7 +155,7 @@ class TelebipEnv(VecEnv):
             energy_share=self._energy_share,
             fallen=terminated,
         )
-        terms = torch.stack([term(context, cfg.reward) for term in REWARDS.values()])
+        terms = torch.stack([term(context) for term in self._rewards.values()])
         terms = torch.where(fault & ~torch.isfinite(terms), 0.0, terms)
         self.reward_terms.copy_(terms)
         rewards = terms.sum(0)
@@ -246,7 +247,7 @@ class TelebipEnv(VecEnv):
         )
         *rewards, lin_vel_error, yaw_rate_error, power, speed, falls = rows.masked_fill(fault, 0.0).sum(1) / valid.sum()
         return {
-            **{f"reward/{name}": value for name, value in zip(REWARDS, rewards, strict=True)},
+            **{f"reward/{name}": value for name, value in zip(self._rewards, rewards, strict=True)},
             "error/lin_vel_mps": lin_vel_error,
             "error/yaw_rate_radps": yaw_rate_error,
             "walk/cost_of_transport": power / (self.robot.weight * speed),

@@ -1,7 +1,7 @@
 """The reward modules: r = r_cmd + r_diff + r_tq + r_foot + r_T, per policy step, and r_energy, which is ours.
 
 Each term is a pure function; `REWARDS` at the end is the list that the environment sums, beside the YAML that holds every
-coefficient. To add a term: write its function, give it a row in `REWARDS` and its coefficients a place in the configuration.
+coefficient. To add a term, mark its function with `reward_term` and weigh it in the YAML, `reward.extra`; see docs/rewards.md.
 """
 
 from collections.abc import Callable
@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from telebip.config import RewardConfig
+from telebip.errors import UserError, nearest
 from telebip.mdp.context import StepContext
 
 
@@ -142,3 +143,36 @@ REWARDS: dict[str, Callable[[StepContext, RewardConfig], Tensor]] = {
     "energy": lambda s, c: s.energy_share * energy(s.state.joint_power, s.weight, c.energy.k_energy),
     "termination": lambda s, c: termination(s.fallen, c.termination.k_termination),
 }
+
+
+Term = Callable[[StepContext], Tensor]
+"""A reward as a function of the step: (num_envs,)."""
+
+EXTRA: dict[str, Term] = {}
+"""Terms that a task may weigh by name in `reward.extra`; `reward_term` enters them."""
+
+
+def reward_term(function: Term) -> Term:
+    """Let tasks weigh `function` by its name: with `reward.extra: {name: weight}` they add weight * function(step).
+
+    Raises:
+        ValueError: a term of `REWARDS` has this name.
+    """
+    if function.__name__ in REWARDS:
+        raise ValueError(f"a reward term of telebip is called '{function.__name__}'")
+    EXTRA[function.__name__] = function
+    return function
+
+
+def reward_terms(cfg: RewardConfig) -> dict[str, Term]:
+    """Return every term of a task, weights applied: those of `REWARDS`, then those of `reward.extra`.
+
+    Raises:
+        UserError: `reward.extra` names a function that is not there.
+    """
+    for name in cfg.extra:
+        if name not in EXTRA:
+            hint = nearest(name, EXTRA) if EXTRA else "no function is"
+            raise UserError(f"reward.extra.{name}: no function '{name}' is marked @reward_term; {hint} (see docs/rewards.md)")
+    own = {name: lambda s, term=term: term(s, cfg) for name, term in REWARDS.items()}
+    return own | {name: lambda s, term=EXTRA[name], weight=weight: weight * term(s) for name, weight in cfg.extra.items()}
