@@ -8,12 +8,20 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
 from telebip import ROOT
 from telebip.cli.common import Parser
 from telebip.errors import UserError, nearest
 from telebip.viz.opengl import choose_opengl
 
+if TYPE_CHECKING:
+    from telebip.control.policy import Policy
+    from telebip.env import TelebipEnv
+    from telebip.eval.rollout import Rollout
+    from telebip.viz.scene import Actor
+
+SECONDS = 10.0  # walked for the pictures
 EXAMPLES = """\
   gallery.py
   gallery.py --checkpoint assets/policies/telebip_flat --only walking.gif stride.png
@@ -44,22 +52,26 @@ class Gallery:
     """The pictures of one policy at one command; each method writes one file, or returns why it did not."""
 
     def __init__(self, checkpoint: str, command: tuple[float, float, float]) -> None:
-        """Walk the policy for ten seconds from rest."""
-        from telebip.env import TelebipEnv
+        """Walk the policy from rest."""
         from telebip.eval.conditions import as_evaluated
-        from telebip.eval.rollout import roll_out
         from telebip.rl.checkpoint import load_checkpoint
         from telebip.rl.policy import load_policy
         from telebip.robot import load_robot
         from telebip.viz.scene import line_up
 
-        self.checkpoint = load_checkpoint(checkpoint)
-        config = as_evaluated(self.checkpoint.config, num_envs=1, duration=10.0)
-        self.robot = load_robot(config.sim.robot)
-        env = TelebipEnv(config, self.robot, "cpu", "native")
-        env.set_command(*command)
-        self.rollout = roll_out(env, load_policy(self.checkpoint, "cpu"), round(10.0 / env.step_dt))
-        self.actors = line_up([("policy", self.rollout)])
+        self.checkpoint, self.command = load_checkpoint(checkpoint), command
+        self.config = as_evaluated(self.checkpoint.config, num_envs=1, duration=SECONDS)
+        self.robot = load_robot(self.config.sim.robot)
+        self.rollout = self._walk(lambda env: load_policy(self.checkpoint, "cpu"))
+        self.actors = line_up([("RL", self.rollout)])
+
+    def _walk(self, make_policy: "Callable[[TelebipEnv], Policy]") -> "Rollout":
+        from telebip.env import TelebipEnv
+        from telebip.eval.rollout import roll_out
+
+        env = TelebipEnv(self.config, self.robot, "cpu", "native")
+        env.set_command(*self.command)
+        return roll_out(env, make_policy(env), round(SECONDS / env.step_dt))
 
     def walking(self, file: Path) -> None:
         """Eight strides as a GIF."""
@@ -106,7 +118,21 @@ class Gallery:
         return None
 
     def recording(self, file: Path) -> str | None:
-        """A screenshot of the recording in the rerun viewer, which takes a display, or Xvfb and a software Vulkan."""
+        """The recording in the rerun viewer."""
+        walking = [replace(self.actors[0], rollout=self.rollout.after(2.16))]  # mid-stance when the shot is taken
+        return self._screenshot(walking, file)
+
+    def comparison(self, file: Path) -> str | None:
+        """The policy beside the two model-based walkers, in the rerun viewer."""
+        from telebip.control.factory import PLACEMENTS, make_controller
+        from telebip.viz.scene import line_up
+
+        walks = [("RL", self.rollout)]
+        walks += [(name.upper(), self._walk(lambda env, name=name: make_controller(name, env))) for name in PLACEMENTS]
+        return self._screenshot(line_up([(name, rollout.after(2.16)) for name, rollout in walks]), file)
+
+    def _screenshot(self, actors: "Sequence[Actor]", file: Path) -> str | None:
+        """Record, and let the viewer take a picture of itself: on a display, or through Xvfb and a software Vulkan."""
         from telebip.viz.opengl import has_display
         from telebip.viz.rerun import record
 
@@ -116,8 +142,7 @@ class Gallery:
             return "left as it is: no display; on Debian, apt-get install xvfb mesa-vulkan-drivers"
         with TemporaryDirectory() as folder:
             rrd, shot = Path(folder) / "walk.rrd", Path(folder) / "shot.png"
-            walking = [replace(self.actors[0], rollout=self.rollout.after(2.16))]  # mid-stance when the shot is taken
-            record(walking, self.robot.path.with_suffix(".urdf"), rrd)
+            record(actors, self.robot.path.with_suffix(".urdf"), rrd)
             viewed = [str(viewer), str(rrd), "--port", "auto", "--window-size", "1500x900", "--screenshot-to", str(shot)]
             subprocess.run([*screen, *viewed], capture_output=True, timeout=180, env={"XDG_RUNTIME_DIR": folder, **os.environ})
             if not shot.is_file():
@@ -135,6 +160,7 @@ PICTURES: dict[str, Callable[[Gallery, Path], str | None]] = {
     "stride.png": Gallery.stride,
     "learning.png": Gallery.learning,
     "recording.png": Gallery.recording,
+    "comparison.png": Gallery.comparison,
 }
 
 

@@ -21,8 +21,9 @@ from telebip.viz.rerun import log_mesh, viewer
 from telebip.viz.scene import LANE
 from telebip.viz.urdf import Array, link_poses, load_urdf
 
-WORLDS, SECONDS, FPS = 4, 4.0, 25
-BUDGET = 0.03  # share of the training's time that walks may take
+WORLDS, SECONDS = 4, 4.0
+FRAME_STEPS = 4  # policy steps from one frame to the next
+BUDGET = 0.03  # share of the training's time that all this may take
 
 CHARTS = {
     "episode length [policy steps]": ("train/episode_length",),
@@ -49,20 +50,20 @@ class LiveView:
     """Streams curves after every iteration, and now and then a new walk, which a thread of its own plays over and over.
 
     The robots live in worlds of their own, with the task's commands and disturbances: the training does not notice them. They
-    walk on the CPU, anew whenever all walks so far have taken less than their share of the time.
+    walk on the CPU, anew whenever curves, walks and frames so far have taken less than their share of the time.
     """
 
     def __init__(self, trainer: Trainer, stream: rr.RecordingStream, budget: float = BUDGET) -> None:
-        """Log the robots' shapes and start the thread; `budget` is the share of the time that walks may take."""
+        """Log the robots' shapes and start the thread; `budget` is the share of the time that may be taken."""
         self._trainer, self._stream, self._budget = trainer, stream, budget
-        self._start, self._spent = time.perf_counter(), 0.0
+        self._start, self._spent, self._played = time.perf_counter(), 0.0, 0.0  # [s], the last two by either thread
         own = [f"num_envs={WORLDS}", f"episode.length={SECONDS + 1.0}", "episode.reset_heading=0"]
         self._env = TelebipEnv(load_task(trainer.env.cfg, own), trainer.env.robot, "cpu", "native")
         self._urdf = load_urdf(trainer.env.robot.path.with_suffix(".urdf"))
         stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         for link in self._urdf.link_map:
             log_mesh(stream, f"world/{link}", self._urdf, link)
-        self._frames: list[dict[str, Array]] = []  # pose of each link in every world (WORLDS, 4, 4), for each frame
+        self._frames: list[dict[str, list[rr.DescribedComponentBatch]]] = []  # for each frame, poses of each link
         self._closing = threading.Event()
         self._player = threading.Thread(target=self._play, daemon=True)
         self._player.start()
@@ -73,7 +74,7 @@ class LiveView:
         self._set_time()
         for name, value in scalars.items():
             self._stream.log(f"training/{name}", rr.Scalars(value))
-        if self._spent <= self._budget * (began - self._start):
+        if self._spent + self._played <= self._budget * (began - self._start):
             self._walk()
         self._spent += time.perf_counter() - began
 
@@ -92,25 +93,25 @@ class LiveView:
         with torch.random.fork_rng(devices=[]):  # new networks draw weights before they are given the learner's
             policy = load_policy(now, "cpu")
         rollout = roll_out(env, policy, round(SECONDS / env.step_dt))
-        every = round(1.0 / (FPS * env.step_dt))
-        qpos = rollout.qpos[::every].astype(float)
+        qpos = rollout.qpos[::FRAME_STEPS].astype(float)
         qpos[..., 1] += LANE * (0.5 * (WORLDS - 1) - np.arange(WORLDS))
         poses = link_poses(self._urdf, qpos.reshape(-1, 13))
         frames = {link: pose.reshape(len(qpos), WORLDS, 4, 4) for link, pose in poses.items()}
-        self._frames = [{link: pose[i] for link, pose in frames.items()} for i in range(len(qpos))]
+        self._frames = [{link: _poses(pose[i]) for link, pose in frames.items()} for i in range(len(qpos))]
 
     def _play(self) -> None:
         """Log the latest walk in real time, over and over, until `close`."""
         shown, frame = self._frames, 0
-        while not self._closing.wait(1.0 / FPS):
+        while not self._closing.wait(FRAME_STEPS * self._env.step_dt):
             if frame >= len(shown):
                 shown, frame = self._frames, 0
             if shown:
+                began = time.thread_time()
                 self._set_time()
-                for link, pose in shown[frame].items():
-                    poses = rr.InstancePoses3D(translations=pose[:, :3, 3], mat3x3=pose[:, :3, :3])
+                for link, poses in shown[frame].items():
                     self._stream.log(f"world/{link}", poses)
                 frame += 1
+                self._played += time.thread_time() - began
 
     def _set_time(self) -> None:
         """Set the calling thread's time: samples, which the viewer follows, and seconds, which can be played again."""
@@ -120,3 +121,8 @@ class LiveView:
 
 def _entities(names: tuple[str, ...]) -> list[str]:
     return [f"/training/{name}" for name in names] or ["/training/reward/**"]
+
+
+def _poses(pose: Array) -> list[rr.DescribedComponentBatch]:
+    """Return what is logged of a link's poses (WORLDS, 4, 4), made ready once, as each walk is played many times."""
+    return list(rr.InstancePoses3D(translations=pose[:, :3, 3], mat3x3=pose[:, :3, :3]).as_component_batches())
