@@ -45,3 +45,7 @@ def _help() -> str:
     return "\n".join(
         ["usage: telebip COMMAND [OPTIONS]", "", *lines, "", "telebip COMMAND --help lists a command's options, with examples."]
     )
+
+
+if __name__ == "__main__":
+    main()

@@ -52,7 +52,10 @@ def main(argv: Sequence[str] | None = None) -> None:
 def _train(options: argparse.Namespace, task: str, config: TaskConfig, run_dir: Path | None, checkpoint) -> None:
     from rich.console import Console
 
-    console = Console(highlight=False, soft_wrap=True)
+    from telebip.rl.distributed import Ranks, joined
+
+    ranks = Ranks.from_environment()
+    console = Console(highlight=False, soft_wrap=True, quiet=not ranks.is_main)
     with console.status("loading torch and the physics engine"):
         from telebip.env import TelebipEnv
         from telebip.rl.process import prepare_cpu
@@ -64,31 +67,33 @@ def _train(options: argparse.Namespace, task: str, config: TaskConfig, run_dir: 
         from telebip.viz.rerun import require_viewer
 
         require_viewer(options.connect)
-    device = resolve_device(options.device)
+    device = resolve_device(ranks.device_name(options.device))
     if device.type == "cpu":
         prepare_cpu()
-    robot = load_robot(config.sim.robot)
-    with console.status("creating the worlds (the warp backend compiles for a minute or two the first time)"):
-        env = TelebipEnv(config, robot, device, options.backend)
-        run_dir = run_dir or create_run_dir(Path(options.log_dir), task)
-        trainer = Trainer(env, task, run_dir)
-    if checkpoint:
-        trainer.resume(checkpoint)
-    total = config.ppo.max_iterations
-    if trainer.iteration >= total:
-        console.print(f"{run_dir} has finished its {total} iterations; raise --max-iterations to train on")
-        return
-    backend = type(env.sim).__name__.removesuffix("Simulator").lower()
-    describe_run(run_dir, config, str(device), backend)
-    arithmetic = "bfloat16" if trainer.learner.use_mixed_precision else "float32"
-    console.print(f"{task}: {config.num_envs} worlds on {device} ({backend}), update in {arithmetic}, writing to {run_dir}")
-    if trainer.iteration:
-        console.print(f"resuming after iteration {trainer.iteration} of {total}")
+    with joined(ranks, device), ExitStack() as stack:
+        robot = load_robot(config.sim.robot)
+        with console.status("creating the worlds (the warp backend compiles for a minute or two the first time)"):
+            env = TelebipEnv(load_task(config, [f"seed={config.seed + ranks.rank}"]), robot, device, options.backend)
+            run_dir = run_dir or (create_run_dir(Path(options.log_dir), task) if ranks.is_main else Path())
+            trainer = Trainer(env, task, run_dir, ranks)
+        if checkpoint:
+            trainer.resume(checkpoint)
+        total = config.ppo.max_iterations
+        if trainer.iteration >= total:
+            console.print(f"{run_dir} has finished its {total} iterations; raise --max-iterations to train on")
+            return
+        backend = type(env.sim).__name__.removesuffix("Simulator").lower()
+        if ranks.is_main:
+            describe_run(run_dir, config, str(device), backend, ranks.size)
+        arithmetic = "bfloat16" if trainer.learner.use_mixed_precision else "float32"
+        worlds = f"{config.num_envs} worlds" if ranks.size == 1 else f"{ranks.size} processes x {config.num_envs} worlds"
+        console.print(f"{task}: {worlds} on {device} ({backend}), update in {arithmetic}, writing to {run_dir}")
+        if trainer.iteration:
+            console.print(f"resuming after iteration {trainer.iteration} of {total}")
 
-    with ExitStack() as stack:
         stop = stack.enter_context(stop_on_signal(console))
         show = watch = stack.enter_context(progress_bar(console, trainer))
-        if options.viewer == "rerun":
+        if options.viewer == "rerun" and ranks.is_main:
             from telebip.viz.live import live_view
 
             live = stack.enter_context(live_view(trainer, options.connect))

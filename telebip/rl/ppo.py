@@ -41,7 +41,9 @@ class MiniBatch:
 
 
 class FastPPO(PPO):
-    """PPO for feed-forward actors and critics on one device, without rsl-rl's extensions (RND, symmetry, several GPUs).
+    """PPO for feed-forward actors and critics, without rsl-rl's extensions (RND, symmetry).
+
+    With `multi_gpu_cfg` several processes make one update from the samples of them all: see `telebip.rl.distributed`.
 
     With `use_mixed_precision` the networks run in bfloat16 in the rollout too, not in the update alone: the likelihood ratio
     then compares the policy with itself, and not one rounding of it with another.
@@ -71,6 +73,8 @@ class FastPPO(PPO):
         """Compute returns and normalised advantages of the stored rollout, which ended at `obs`."""
         with self._autocast():
             super().compute_returns(obs)
+        if self.is_multi_gpu:
+            self._normalize_advantages()
 
     def update(self) -> dict[str, float]:
         """Run the configured epochs over the stored rollout and return the mean losses."""
@@ -78,6 +82,10 @@ class FastPPO(PPO):
         for batch in self._mini_batches() * self.num_learning_epochs:
             self.optimizer.zero_grad()
             actor, critic = self._side_by_side(partial(self._actor_gradient, batch), partial(self._critic_gradient, batch))
+            if self.is_multi_gpu:
+                self.reduce_parameters()  # of which it averages the gradients
+            for network in (self.actor, self.critic):
+                nn.utils.clip_grad_norm_(network.parameters(), self.max_grad_norm)
             self.optimizer.step()
             sums += torch.stack([critic, *actor])
         obs = self.storage.observations.flatten(0, 1)
@@ -119,7 +127,7 @@ class FastPPO(PPO):
         return [MiniBatch(*rows) for rows in zip(*(column.split(size) for column in columns), strict=True)]
 
     def _actor_gradient(self, b: MiniBatch) -> tuple[Tensor, Tensor]:
-        """Accumulate the gradient of surrogate loss and entropy bonus, clip it, and adapt the learning rate."""
+        """Accumulate the gradient of surrogate loss and entropy bonus, and adapt the learning rate."""
         distribution = self.actor.distribution
         distribution.update(self._forward(self.actor, b.actor_obs))
         with torch.no_grad():
@@ -130,25 +138,40 @@ class FastPPO(PPO):
         surrogate = torch.max(-advantages * ratio, -advantages * clipped).mean()
         entropy = distribution.entropy.mean()
         (surrogate - self.entropy_coef * entropy).backward()
-        nn.utils.clip_grad_norm_(self.actor.parameters(), self.max_grad_norm)
         return surrogate.detach(), entropy.detach()
 
     def _critic_gradient(self, b: MiniBatch) -> Tensor:
-        """Accumulate the gradient of the clipped value loss, and clip it."""
+        """Accumulate the gradient of the clipped value loss."""
         values = self._forward(self.critic, b.critic_obs)
         clipped = b.values + (values - b.values).clamp(-self.clip_param, self.clip_param)
         loss = torch.max((values - b.returns).pow(2), (clipped - b.returns).pow(2)).mean()
         (self.value_loss_coef * loss).backward()
-        nn.utils.clip_grad_norm_(self.critic.parameters(), self.max_grad_norm)
         return loss.detach()
 
     def _adapt_learning_rate(self, kl: Tensor) -> None:
         """Lower the learning rate by 1.5 where the KL divergence is over twice the desired one, raise it where under half."""
         if self.schedule != "adaptive":
             return
+        kl = self._sum_over_processes(kl) / self.gpu_world_size
         if kl > 2.0 * self.desired_kl:
             self.learning_rate = max(1e-5, self.learning_rate / 1.5)
         elif 0.0 < kl < self.desired_kl / 2.0:
             self.learning_rate = min(1e-2, self.learning_rate * 1.5)
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate
+
+    def _normalize_advantages(self) -> None:
+        """Normalise by the mean and deviation over all processes' samples, as rsl-rl does over those of one."""
+        advantages = self.storage.returns - self.storage.values
+        number = advantages.numel() * self.gpu_world_size
+        deviation = advantages - self._sum_over_processes(advantages.sum()) / number
+        variance = self._sum_over_processes(deviation.square().sum()) / (number - 1)
+        self.storage.advantages = deviation / (variance.sqrt() + 1e-8)
+
+    def _sum_over_processes(self, value: Tensor) -> Tensor:
+        """Return the sum of a tensor over all processes, every one of which has to ask."""
+        if not self.is_multi_gpu:
+            return value
+        total = value.clone()
+        torch.distributed.all_reduce(total)
+        return total

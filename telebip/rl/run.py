@@ -34,7 +34,7 @@ def create_run_dir(log_dir: Path, task: str) -> Path:
     raise UserError(f"log folder '{log_dir / task}' has a hundred runs of this second")
 
 
-def describe_run(run_dir: Path, config: TaskConfig, device: str, backend: str) -> None:
+def describe_run(run_dir: Path, config: TaskConfig, device: str, backend: str, processes: int = 1) -> None:
     """Write `config.yaml`, complete, and append this start's versions, git revision and command line to `run.json`."""
     (run_dir / "config.yaml").write_text(to_yaml(config), encoding="utf-8")
     start = {
@@ -42,6 +42,7 @@ def describe_run(run_dir: Path, config: TaskConfig, device: str, backend: str) -
         "command": sys.argv,
         "device": device,
         "backend": backend,
+        "processes": processes,
         "git_revision": git_revision(),
         "git_dirty": bool(_git("status", "--porcelain", "--untracked-files=no")),
         "python": platform.python_version(),

@@ -21,6 +21,7 @@ from telebip.errors import UserError
 from telebip.mdp.curriculum import ramp
 from telebip.rl.checkpoint import Checkpoint, save_checkpoint
 from telebip.rl.curve import CurveWriter
+from telebip.rl.distributed import Ranks
 from telebip.rl.policy import OBS_GROUPS, actor_cfg, critic_cfg
 from telebip.rl.ppo import FastPPO
 from telebip.rl.symmetry import SymmetricEnv
@@ -29,9 +30,9 @@ from telebip.rl.symmetry import SymmetricEnv
 class Trainer:
     """Trains one policy in one run folder."""
 
-    def __init__(self, env: TelebipEnv, task: str, run_dir: Path) -> None:
-        """Build the learner for `env`; nothing is written before `learn`."""
-        self.env, self.task, self.run_dir = env, task, run_dir
+    def __init__(self, env: TelebipEnv, task: str, run_dir: Path, ranks: Ranks | None = None) -> None:
+        """Build the learner for `env`, the same in every process of `ranks`; nothing is written before `learn`."""
+        self.env, self.task, self.run_dir, self.ranks = env, task, run_dir, ranks or Ranks()
         self.iteration = self.samples = 0
         ppo = env.cfg.ppo
         if ppo.num_mini_batches > env.num_envs * ppo.num_steps_per_env:
@@ -41,7 +42,9 @@ class Trainer:
             )
         torch.manual_seed(env.cfg.seed)
         with contextlib.redirect_stdout(io.StringIO()):  # rsl-rl prints the networks
-            self.learner = FastPPO.construct_algorithm(env.get_observations(), env, _rsl_rl_cfg(env), str(env.device))
+            self.learner = FastPPO.construct_algorithm(env.get_observations(), env, self._rsl_rl_cfg(), str(env.device))
+        if self.ranks.size > 1:
+            self.learner.broadcast_parameters()
         self._view = SymmetricEnv(env) if ppo.symmetry == "phase" else env
         self._episodes = EpisodeStatistics(env.num_envs, env.device)
 
@@ -59,18 +62,17 @@ class Trainer:
         """Train up to the configured total of iterations, or until `stop()` holds, and save a checkpoint at the end.
 
         Args:
-            stop: asked after every iteration.
+            stop: asked after every iteration; one process that says so stops them all.
             report: called after every iteration with what TensorBoard gets.
         """
         env, view, learner, cfg = self.env, self._view, self.learner, self.env.cfg.ppo
-        writer = SummaryWriter(str(self.run_dir), purge_step=self.samples + 1)
-        curve = CurveWriter(self.run_dir, self.samples)
+        log = RunLog(self.run_dir, self.samples) if self.ranks.is_main else None
         # Spread the time-outs over the iterations.
         ages = torch.randint(env.max_episode_length, (env.num_envs,), generator=env.generator, device=env.device)
         env.episode_length_buf = ages
         learner.train_mode()
         obs = view.get_observations()
-        while self.iteration < cfg.max_iterations and not stop():
+        while self.iteration < cfg.max_iterations and not self.ranks.any(stop(), env.device):
             start = time.perf_counter()
             logs: dict[str, Tensor] = {}
             env.set_progress(self.samples)
@@ -87,7 +89,7 @@ class Trainer:
             learned = time.perf_counter()
 
             self.iteration += 1
-            batch = env.num_envs * cfg.num_steps_per_env
+            batch = env.num_envs * cfg.num_steps_per_env * self.ranks.size
             self.samples += batch
             counts = {key: value.item() for key, value in logs.items() if key.startswith("fault/")}
             means = {key: value.item() / cfg.num_steps_per_env for key, value in logs.items() if key not in counts}
@@ -104,21 +106,61 @@ class Trainer:
                 "speed/collect_s": collected - start,
                 "speed/learn_s": learned - collected,
             }
-            for key, value in scalars.items():
-                writer.add_scalar(key, value, self.samples)
-            curve.add({"iteration": self.iteration, "samples": self.samples, **scalars})
+            if log:
+                log.add(self.iteration, self.samples, scalars)
             if self.iteration % cfg.save_interval == 0:
                 self.save()
             report(scalars)
         self.save()
-        writer.close()
+        if log:
+            log.close()
 
     def save(self) -> None:
-        """Write `model_<iteration>.pt`, to go on from, and `policy.pt`, the actor alone."""
+        """Write `model_<iteration>.pt`, to go on from, and `policy.pt`, the actor alone; the first process does."""
+        if not self.ranks.is_main:
+            return
         state = self.learner.save()
         actor = {"actor_state_dict": state["actor_state_dict"]}
         for name, part in ((f"model_{self.iteration}.pt", state), ("policy.pt", actor)):
             save_checkpoint(self.run_dir / name, self.task, self.env.cfg, self.iteration, self.samples, part)
+
+    def _rsl_rl_cfg(self) -> dict:
+        env, ppo = self.env, self.env.cfg.ppo
+        algorithm = (
+            "num_learning_epochs num_mini_batches learning_rate schedule desired_kl gamma lam clip_param value_loss_coef "
+            "entropy_coef max_grad_norm"
+        )
+        return {
+            "num_steps_per_env": ppo.num_steps_per_env,
+            "obs_groups": OBS_GROUPS,
+            "multi_gpu": self.ranks.multi_gpu_cfg,
+            "algorithm": {
+                "class_name": FastPPO,
+                **{name: getattr(ppo, name) for name in algorithm.split()},
+                "use_mixed_precision": uses_bfloat16(ppo.mixed_precision, env.device),
+            },
+            "actor": {"class_name": "MLPModel", **actor_cfg(ppo)},
+            "critic": {"class_name": "MLPModel", **critic_cfg(ppo)},
+        }
+
+
+class RunLog:
+    """A run folder's numbers: TensorBoard's files and `learning.csv`."""
+
+    def __init__(self, run_dir: Path, samples: int) -> None:
+        """Open them at `samples` environment steps; what lies beyond is dropped."""
+        self._writer = SummaryWriter(str(run_dir), purge_step=samples + 1)
+        self._curve = CurveWriter(run_dir, samples)
+
+    def add(self, iteration: int, samples: int, scalars: dict[str, float]) -> None:
+        """Append one iteration's scalars."""
+        for key, value in scalars.items():
+            self._writer.add_scalar(key, value, samples)
+        self._curve.add({"iteration": iteration, "samples": samples, **scalars})
+
+    def close(self) -> None:
+        """Write what TensorBoard's writer still holds."""
+        self._writer.close()
 
 
 class EpisodeStatistics:
@@ -164,23 +206,3 @@ def uses_bfloat16(mixed_precision: str, device: torch.device) -> bool:
         return torch.cuda.is_bf16_supported(including_emulation=False)
     capabilities = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}
     return bool(capabilities.get("avx512_bf16") or capabilities.get("amx_bf16"))
-
-
-def _rsl_rl_cfg(env: TelebipEnv) -> dict:
-    ppo = env.cfg.ppo
-    algorithm = (
-        "num_learning_epochs num_mini_batches learning_rate schedule desired_kl gamma lam clip_param value_loss_coef "
-        "entropy_coef max_grad_norm"
-    )
-    return {
-        "num_steps_per_env": ppo.num_steps_per_env,
-        "obs_groups": OBS_GROUPS,
-        "multi_gpu": None,
-        "algorithm": {
-            "class_name": FastPPO,
-            **{name: getattr(ppo, name) for name in algorithm.split()},
-            "use_mixed_precision": uses_bfloat16(ppo.mixed_precision, env.device),
-        },
-        "actor": {"class_name": "MLPModel", **actor_cfg(ppo)},
-        "critic": {"class_name": "MLPModel", **critic_cfg(ppo)},
-    }

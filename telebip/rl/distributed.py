@@ -1,0 +1,88 @@
+"""Data-parallel training: processes that torchrun starts, each with its own worlds and seed, learn one policy together.
+
+    torchrun --nproc-per-node 8 scripts/train.py --task telebip_flat --device cuda
+
+Every process collects its own rollout; gradients, observation statistics, advantages' mean and deviation, and the KL divergence
+are averaged over all of them, so that n processes with one world each learn what one process with n worlds would. The first
+process alone prints, logs and saves. GPUs talk through NCCL, CPUs through gloo.
+"""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from telebip.errors import UserError
+
+if TYPE_CHECKING:
+    import torch  # importing it takes a second, in which a command should already know whether to print
+
+
+@dataclass(frozen=True)
+class Ranks:
+    """Which of how many processes this one is; one of one where torchrun did not start it."""
+
+    rank: int = 0
+    local_rank: int = 0  # on this machine
+    size: int = 1
+
+    @staticmethod
+    def from_environment() -> "Ranks":
+        """Read what torchrun tells its processes."""
+        return Ranks(
+            *(int(os.environ.get(name, default)) for name, default in (("RANK", 0), ("LOCAL_RANK", 0), ("WORLD_SIZE", 1)))
+        )
+
+    @property
+    def is_main(self) -> bool:
+        """Whether this process prints, logs and saves."""
+        return self.rank == 0
+
+    @property
+    def multi_gpu_cfg(self) -> dict[str, int] | None:
+        """Return what `rsl_rl.algorithms.PPO` wants to know, on CPUs too."""
+        if self.size == 1:
+            return None
+        return {"global_rank": self.rank, "local_rank": self.local_rank, "world_size": self.size}
+
+    def device_name(self, asked: str) -> str:
+        """Return the device of this process: with several of them, a GPU of its own wherever CUDA was meant.
+
+        Raises:
+            UserError: all processes were sent to one GPU.
+        """
+        import torch
+
+        if self.size == 1 or asked == "cpu" or (asked == "auto" and not torch.cuda.is_available()):
+            return asked
+        if asked not in ("auto", "cuda"):
+            raise UserError(f"torchrun gives each process a GPU of its own; say --device cuda, not '{asked}'")
+        return f"cuda:{self.local_rank}"
+
+    def any(self, flag: bool, device: "torch.device") -> bool:
+        """Whether `flag` holds in any process; all of them have to ask."""
+        if self.size == 1:
+            return flag
+        import torch.distributed
+
+        flags = torch.tensor(float(flag), device=device)
+        torch.distributed.all_reduce(flags, op=torch.distributed.ReduceOp.MAX)
+        return bool(flags > 0.0)
+
+
+@contextmanager
+def joined(ranks: Ranks, device: "torch.device") -> Iterator[None]:
+    """Connect the processes for the duration of the context."""
+    if ranks.size == 1:
+        yield
+        return
+    import torch.distributed
+
+    if device.type == "cuda":
+        torch.cuda.set_device(device)
+    torch.distributed.init_process_group("nccl" if device.type == "cuda" else "gloo", rank=ranks.rank, world_size=ranks.size)
+    try:
+        yield
+    finally:
+        torch.distributed.destroy_process_group()
