@@ -48,6 +48,8 @@ def refusal(script: str, *arguments: str) -> str:
         ([TRAIN, "--task", "telebip_flat", "--num-env", "8"], ["--num-env", "did you mean '--num-envs'?"]),
         ([TRAIN], ["--task", "telebip_flat"]),
         ([PLAY, "--agent", "zero", "--duration", "-1"], ["--duration", "-1"]),
+        ([PLAY, "--controller", "alp"], ["--controller", "'alp'", "'alip', 'dcm'"]),
+        ([PLAY, "--controller", "dcm", "control.step_tim=1"], ["did you mean 'control.step_time'?"]),
         ([PLAY, "--agent", "zero", "--record", "foo.txt"], ["--record", "foo.txt", ".rrd", ".mp4"]),
         ([GALLERY, "--only", "waling.gif"], ["waling.gif", "did you mean 'walking.gif'?"]),
         ([PLAY, "--agent", "zero", "--show", "0"], ["--show", "at least 1"]),
@@ -131,6 +133,13 @@ def test_pictures_are_made_anew(tmp_path: Path) -> None:
     assert [line.split(":")[0] for line in text.splitlines()] == [f"{tmp_path}/control_loop.png", f"{tmp_path}/stride.png"]
     for name in ("control_loop.png", "stride.png"):
         assert 10_000 < (tmp_path / name).stat().st_size < 300_000
+
+
+def test_a_model_based_walker_can_be_played() -> None:
+    text = ran(
+        PLAY, "--controller", "alip", "--command", "0.5", "0", "0", "--duration", "1", "--device", "cpu", "control.reach=0.4"
+    )
+    assert "controller 'alip': telebip_flat, 1 world x 1 s" in text
 
 
 def test_a_run_goes_on_in_its_folder(run_dir: Path) -> None:
