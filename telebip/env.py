@@ -74,6 +74,7 @@ class TelebipEnv(VecEnv):
         self.command = zeros(3)  # what the policy sees: the target command and the heading hold's correction
         self.target_command = zeros(3)
         self.reference_heading = zeros()  # [rad]
+        self.reward_names = tuple(self._rewards)
         self.reward_terms = torch.zeros(len(self._rewards), self.num_envs, device=self.device)  # of the last step
         self.push_wrench_w = zeros(6)  # on the trunk's centre of mass, world frame [N, N m]
         self._push_timer = zeros()  # time until the next push starts [s]

@@ -20,6 +20,7 @@ class Rollout:
 
     step_dt: float  # [s]
     weight: float  # m g of the robot [N]
+    reward_names: tuple[str, ...]  # of the terms in `reward_terms`
     qpos: NDArray[np.float32]  # (steps, num_envs, 13), as in SimState
     qvel: NDArray[np.float32]  # (steps, num_envs, 12), as in SimState
     joint_target: NDArray[np.float32]  # (steps, num_envs, 6) [rad | m]
@@ -32,7 +33,7 @@ class Rollout:
     command: NDArray[np.float32]  # (steps, num_envs, 3): the target command, without the heading hold [m/s, m/s, rad/s]
     reference_heading: NDArray[np.float32]  # (steps, num_envs) [rad]
     reward: NDArray[np.float32]  # (steps, num_envs)
-    reward_terms: NDArray[np.float32]  # (steps, num_envs, terms), in the order of `REWARDS`; their sum is `reward`
+    reward_terms: NDArray[np.float32]  # (steps, num_envs, terms); their sum is `reward`
     fallen: NDArray[np.bool_]  # (steps, num_envs): the episode ended here by a fall or a fault
 
     @property
@@ -50,7 +51,8 @@ class Rollout:
         return self._map(lambda array: array[:, worlds])
 
     def _map(self, part: Callable[[np.ndarray], np.ndarray]) -> "Rollout":
-        arrays = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in ("step_dt", "weight")}
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
         return dataclasses.replace(self, **{name: part(array) for name, array in arrays.items()})
 
 
@@ -83,4 +85,4 @@ def roll_out(env: TelebipEnv, policy: Policy, steps: int, progress: Callable[[in
             rows[-1] |= {"command": command, "reward": reward, "fallen": dones & ~extras["time_outs"]}
             progress(step + 1)
     arrays = {name: torch.stack([row[name] for row in rows]).cpu().numpy() for name in rows[0]}
-    return Rollout(step_dt=env.step_dt, weight=env.robot.weight, **arrays)
+    return Rollout(step_dt=env.step_dt, weight=env.robot.weight, reward_names=env.reward_names, **arrays)

@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from telebip.eval.rollout import Rollout
 from telebip.eval.walk import heading_velocity
-from telebip.mdp.rewards import REWARDS
 from telebip.robot import FEET, JOINTS
 from telebip.viz.scene import Color
 
@@ -60,7 +59,7 @@ def plots(rollout: Rollout, world: int) -> dict[str, Plot]:
     hips = [i for i, name in enumerate(JOINTS) if not name.endswith("knee")]
     knees = [i for i, name in enumerate(JOINTS) if name.endswith("knee")]
     shades = ((235, 110, 80), (250, 180, 90), (80, 160, 235), (110, 220, 210))
-    terms = zip(REWARDS, rollout.reward_terms[:, world].T, strict=True)
+    terms = zip(rollout.reward_names, rollout.reward_terms[:, world].T, strict=True)
     return {
         "speed": Plot("speed [m/s]", {"command": Curve(command[:, 0], COMMAND), "forward": Curve(velocity[:, 0], TOTAL)}),
         "side_speed": Plot(

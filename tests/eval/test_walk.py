@@ -46,7 +46,7 @@ def walk(steps: int = 200, worlds: int = 2, **replaced: Any) -> Rollout:
         if name in replaced:
             array[...] = replaced[name]
         arrays[name] = array
-    return Rollout(step_dt=STEP_DT, weight=WEIGHT, **arrays)
+    return Rollout(step_dt=STEP_DT, weight=WEIGHT, reward_names=tuple(REWARDS), **arrays)
 
 
 def velocity(forward: float, left: float = 0.0) -> NDArray[np.floating]:
