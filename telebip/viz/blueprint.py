@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import rerun as rr
 import rerun.blueprint as rrb
 
 AROUND_THE_CURSOR = rrb.VisibleTimeRange(
@@ -59,9 +60,15 @@ def training_layout(curves: dict[str, Sequence[str]]) -> rrb.Blueprint:
     Args:
         curves: entities of the learning curves for each plot, by its title.
     """
+    everything = (rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.infinite())
     charts = [
         rrb.TimeSeriesView(
-            name=title, origin="/", contents=list(entities), plot_legend=rrb.PlotLegend(visible=len(entities) > 1)
+            name=title,
+            origin="/",
+            contents=list(entities),
+            plot_legend=rrb.PlotLegend(visible=len(entities) > 1 or "**" in entities[0]),
+            axis_x=rrb.TimeAxis(view_range=rr.TimeRange(*everything)),
+            time_ranges=rrb.VisibleTimeRange("samples", start=everything[0], end=everything[1]),
         )
         for title, entities in curves.items()
     ]
@@ -80,6 +87,7 @@ def robots_view(followed: str | None, robots: int) -> rrb.Spatial3DView:
         robots: how many have to fit into the picture.
     """
     away = 1.0 + 0.35 * (robots - 1)
+    ahead = 0.0 if followed else 1.2  # m: where robots that the camera does not follow are halfway
     return rrb.Spatial3DView(
         name="robots" if robots > 1 else "robot",
         origin="/world",
@@ -87,8 +95,8 @@ def robots_view(followed: str | None, robots: int) -> rrb.Spatial3DView:
         line_grid=rrb.LineGrid3D(visible=True, spacing=0.5, color=[120, 130, 140]),
         eye_controls=rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital,
-            position=[1.2 * away, -2.0 * away, 0.8 * away],
-            look_target=[0.0, 0.0, 0.45],
+            position=[ahead + 1.2 * away, -2.0 * away, 0.8 * away],
+            look_target=[ahead, 0.0, 0.45],
             tracking_entity=followed,
         ),
     )

@@ -157,7 +157,7 @@ def draw_learning(curves: dict[str, Any], label: str) -> Figure:
         for i, (axes, (name, title)) in enumerate(zip(grid.flat, LEARNING.items(), strict=True)):
             values = np.array(curves[name], dtype=float)
             axes.plot(samples, values, color=COLORS[i], lw=1.6)
-            late = values[len(values) // 10 :]  # the first stumbles would set the scale
+            late = values[len(values) // 20 :]  # the first stumbles would set the scale
             axes.set(title=title, ylim=(0, 1.15 * np.nanmax(late)), xlim=(0, samples[-1]))
         for axes in grid[-1]:
             axes.set_xlabel("million samples")
