@@ -63,7 +63,7 @@ def _train(options: argparse.Namespace, task: str, config: TaskConfig, run_dir: 
         from telebip.rl.train import Trainer
         from telebip.robot import load_robot
 
-    if options.viewer == "rerun":
+    if options.viewer == "rerun" and ranks.is_main:
         from telebip.viz.rerun import require_viewer
 
         require_viewer(options.connect)
