@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torch.multiprocessing.spawn import spawn
 
 from telebip import ROOT
@@ -25,6 +26,8 @@ from telebip.robot import load_robot
 SIZE, WORLDS, STEPS = 2, 4, 10
 CPU = torch.device("cpu")
 SMALL = (f"ppo.num_steps_per_env={STEPS}", "ppo.hidden_dims=[16,16]", "ppo.num_mini_batches=1", "ppo.mixed_precision=never")
+STORED = ("actions", "rewards", "dones", "values", "actions_log_prob")
+"""What a rollout holds beside observations and the policy's distribution."""
 
 
 def make_trainer(worlds: int, seed: int, ranks: Ranks | None = None) -> Trainer:
@@ -43,8 +46,9 @@ def collect(trainer: Trainer) -> dict[str, Any]:
             learner.process_env_step(obs, rewards, dones, extras)
     st = learner.storage
     assert st.distribution_params is not None
-    stored = {name: getattr(st, name) for name in ("observations", "actions", "rewards", "dones", "values", "actions_log_prob")}
-    return {**stored, "mean": st.distribution_params[0], "std": st.distribution_params[1], "last": obs}
+    stored = {name: getattr(st, name) for name in STORED}
+    seen = {"observations": st.observations["policy"], "last": obs["policy"]}
+    return {**stored, **seen, "mean": st.distribution_params[0], "std": st.distribution_params[1]}
 
 
 def learn(trainer: Trainer, rollout: dict[str, Any], worlds: slice) -> dict[str, Any]:
@@ -52,10 +56,12 @@ def learn(trainer: Trainer, rollout: dict[str, Any], worlds: slice) -> dict[str,
     learner, st = trainer.learner, trainer.learner.storage
     learner.train_mode()
     with torch.inference_mode():
-        for name in ("observations", "actions", "rewards", "dones", "values", "actions_log_prob"):
+        st.observations["policy"].copy_(rollout["observations"][:, worlds])
+        for name in STORED:
             getattr(st, name).copy_(rollout[name][:, worlds])
         st.distribution_params = tuple(rollout[name][:, worlds].clone() for name in ("mean", "std"))
-        learner.compute_returns(rollout["last"][worlds])
+        last = rollout["last"][worlds]
+        learner.compute_returns(TensorDict({"policy": last}, batch_size=[len(last)]))
     learner.num_learning_epochs = 1
     learner.update()
     networks = (learner.actor, learner.critic)
@@ -74,7 +80,7 @@ def one_of_two(rank: int, port: int, folder: str) -> None:
     with joined(ranks, CPU):
         trainer = make_trainer(WORLDS, seed=1 + rank, ranks=ranks)
         start = trainer.env.sim.state.qpos.clone()
-        rollout = torch.load(f"{folder}/rollout.pt", weights_only=False)
+        rollout = torch.load(f"{folder}/rollout.pt", weights_only=True)
         result = learn(trainer, rollout, slice(rank * WORLDS, (rank + 1) * WORLDS))
         stops = [ranks.any(rank == 1, CPU), ranks.any(False, CPU)]
     torch.save({**result, "start": start, "stops": stops}, f"{folder}/rank_{rank}.pt")
@@ -89,7 +95,7 @@ def test_two_processes_learn_what_one_does(tmp_path: Path) -> None:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     spawn(one_of_two, (port, str(tmp_path)), nprocs=SIZE)
-    first, second = (torch.load(tmp_path / f"rank_{rank}.pt", weights_only=False) for rank in range(SIZE))
+    first, second = (torch.load(tmp_path / f"rank_{rank}.pt", weights_only=True) for rank in range(SIZE))
 
     assert max(g.abs().max() for g in expected["gradient"]) > 1e-3
     torch.testing.assert_close(first["gradient"], expected["gradient"], rtol=1e-4, atol=1e-6)
