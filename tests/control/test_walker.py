@@ -54,10 +54,11 @@ def test_it_walks_sideways_and_turns(make_env: MakeEnv, name: str) -> None:
     sideways = summarise(walk(make_env(calm=True), name, (0.3, 0.1, 0.0), 6.0), skip=3.0)
     assert sideways.falls == 0
     assert sideways.speed == pytest.approx((0.3, 0.1), abs=0.05)
-    straight, turning = (walk(make_env(calm=True), name, (0.5, 0.0, rate), 6.0) for rate in (0.0, 0.1))
-    assert not turning.fallen.any()
+    right, left = (walk(make_env(calm=True), name, (0.5, 0.0, rate), 6.0) for rate in (-0.1, 0.1))
+    assert not right.fallen.any()
+    assert not left.fallen.any()
     # Without a hip yaw joint it follows slowly, on feet that grip: it does turn the right way.
-    assert heading(turning)[-1].mean() - heading(straight)[-1].mean() > 0.05
+    assert heading(left)[-1].mean() - heading(right)[-1].mean() > 0.02
 
 
 @NAMES
