@@ -1,4 +1,4 @@
-"""Settings of the whole process that make training on a CPU fast. Thread counts may change the rounding of sums, nothing else."""
+"""Settings of the whole process that make training on a CPU fast. A thread count may change how sums round, nothing else."""
 
 import ctypes
 import sys
