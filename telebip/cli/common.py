@@ -14,6 +14,10 @@ if TYPE_CHECKING:
     import torch
 
 
+CONTROLLERS = ("alip", "dcm")
+"""Model-based walkers, as `telebip.control.factory.PLACEMENTS` names them; here, so that `--help` needs no torch."""
+
+
 class Parser(argparse.ArgumentParser):
     """An argument parser whose errors are one line that names the nearest valid option."""
 

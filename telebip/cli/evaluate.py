@@ -2,10 +2,11 @@
 
 import argparse
 from collections.abc import Sequence
+from contextlib import contextmanager
 from hashlib import sha256
 from pathlib import Path
 
-from telebip.cli.common import Parser, resolve_device
+from telebip.cli.common import CONTROLLERS, Parser, resolve_device
 from telebip.config import load_task
 from telebip.errors import UserError
 
@@ -96,26 +97,21 @@ def references() -> list[dict]:
     return [as_results(label) for label in TRACKING]
 
 
+@contextmanager
 def progress_bar(console):
-    """Return a context whose value shows what is running, how far it is and how long it will take."""
-    from contextlib import contextmanager
-
+    """Yield a function that shows what is running, how far it is and how long it will take."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-    @contextmanager
-    def bar():
-        columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TextColumn("eta"), TimeRemainingColumn())
-        with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-            tasks = {}
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TextColumn("eta"), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        tasks = {}
 
-            def show(name: str, step: int, total: int) -> None:
-                if name not in tasks:
-                    tasks[name] = progress.add_task(name, total=total)
-                progress.update(tasks[name], completed=step)
+        def show(name: str, step: int, total: int) -> None:
+            if name not in tasks:
+                tasks[name] = progress.add_task(name, total=total)
+            progress.update(tasks[name], completed=step)
 
-            yield show
-
-    return bar()
+        yield show
 
 
 def speeds(text: str) -> tuple[float, ...]:
@@ -130,7 +126,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     who = parser.add_mutually_exclusive_group()
     who.add_argument("--checkpoint", metavar="PATH_OR_RUN", help="a checkpoint file, or a run folder for its newest")
-    who.add_argument("--controller", choices=("alip", "dcm"), help="a model-based walker: angular momentum, or DCM")
+    who.add_argument("--controller", choices=CONTROLLERS, help="a model-based walker: angular momentum, or DCM")
     parser.add_argument(
         "--suite",
         default="tracking,push,gait,learning",

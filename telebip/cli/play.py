@@ -4,14 +4,14 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from telebip.cli.common import Parser, resolve_device
+from telebip.cli.common import CONTROLLERS, Parser, resolve_device
 from telebip.config import TaskConfig, load_task
 from telebip.control.config import split_overrides
 from telebip.errors import UserError
 from telebip.eval.conditions import as_evaluated
 from telebip.viz.opengl import choose_opengl
 
-CONTROLLERS, AGENTS = ("alip", "dcm"), ("zero", "random")
+AGENTS = ("zero", "random")
 SUFFIXES = (".rrd", ".mp4", ".gif", ".png")
 EXAMPLES = """\
   play.py --checkpoint assets/policies/telebip_efficient --viewer rerun

@@ -48,10 +48,10 @@ def main(argv: Sequence[str] | None = None) -> None:
                 if run_dir is None:
                     return
                 name = training.name if seed == training.seeds[0] else f"{training.name}-seed{seed}"
-                _measure(console, out / name, training, options, lambda r=run_dir, t=training: subject_of(str(r), t.label))
+                _measure(console, out / name, training, options, subject_of(str(run_dir), training.label))
     for baseline in BASELINES:
         if not options.only or baseline.name in options.only:
-            subject = lambda b=baseline: controller_subject(b.controller, b.label, b.overrides)  # noqa: E731
+            subject = controller_subject(baseline.controller, baseline.label, baseline.overrides)
             _measure(console, out / baseline.name, baseline, options, subject)
     results = {name: read_results(file) for name in names if (file := out / name / "results.json").is_file()}
     seeds = [f"{t.label} ({len(t.seeds)} seed{'s' if len(t.seeds) > 1 else ''})" for t in TRAININGS if t.name in results]
@@ -97,13 +97,12 @@ def _train(console, training, seed: int, options: argparse.Namespace) -> Path | 
     return run_dir
 
 
-def _measure(console, out: Path, walker, options: argparse.Namespace, make_subject) -> None:
-    """Measure one walker, unless its results are there, newer than its policy and complete."""
+def _measure(console, out: Path, walker, options: argparse.Namespace, subject) -> None:
+    """Measure one walker, unless complete results of the same policy or parameters are there."""
     from telebip.eval.report import make_folder, read_results, write_results
     from telebip.eval.suites import Protocol, evaluate
     from telebip.robot import load_robot
 
-    subject = make_subject()
     protocol = _quick_protocol() if options.quick else Protocol(device=resolve_device(options.device))
     file = out / "results.json"
     if file.is_file() and not options.again:
