@@ -42,7 +42,7 @@ def svg(figure: Figure) -> str:
 
 
 def color(index: int, label: str) -> str:
-    """Colour of the method at a position of the list: a grey for the article's own numbers."""
+    """Colour of the method at a position of the whole list, the same in every plot: a grey for the article's own numbers."""
     return GREYS[index % len(GREYS)] if label.startswith("article") else COLORS[index % len(COLORS)]
 
 
@@ -83,15 +83,15 @@ def feet(results: Results) -> Figure:
 
 def cost_of_transport(all_results: Sequence[Results], commands: Sequence[float] = (0.5, 0.7, 1.0)) -> Figure:
     """Cost of transport by method and commanded speed; the article's formula, which is what the article reports."""
-    shown = [r for r in all_results if any(row["command_mps"] in commands for row in r.get("tracking", ()))]
+    shown = [(k, r) for k, r in enumerate(all_results) if any(row["command_mps"] in commands for row in r.get("tracking", ()))]
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(figsize=(7.2, 3.0))
         width = 0.84 / max(1, len(shown))
-        for i, results in enumerate(shown):
+        for i, (k, results) in enumerate(shown):
             costs = {row["command_mps"]: row["cot_article"] for row in results["tracking"]}
-            x = [k + (i - 0.5 * (len(shown) - 1)) * width for k, command in enumerate(commands) if command in costs]
+            x = [at + (i - 0.5 * (len(shown) - 1)) * width for at, command in enumerate(commands) if command in costs]
             y = [costs[command] for command in commands if command in costs]
-            bars = axes.bar(x, y, 0.92 * width, color=color(i, results["label"]), label=results["label"])
+            bars = axes.bar(x, y, 0.92 * width, color=color(k, results["label"]), label=results["label"])
             axes.bar_label(bars, fmt="%.2f", fontsize=7, padding=1)
         axes.set_xticks(range(len(commands)), [f"{command:g} m/s" for command in commands])
         axes.grid(axis="x", visible=False)
@@ -102,15 +102,15 @@ def cost_of_transport(all_results: Sequence[Results], commands: Sequence[float] 
 
 def push(all_results: Sequence[Results], horizon: str = "10s") -> Figure:
     """Largest push survived, by method and direction."""
-    shown = [r for r in all_results if horizon in (r.get("push") or {})]
+    shown = [(k, r) for k, r in enumerate(all_results) if horizon in (r.get("push") or {})]
     directions = ("forward", "backward", "lateral")
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(figsize=(7.2, 3.0))
         width = 0.84 / max(1, len(shown))
-        for i, results in enumerate(shown):
-            x = [k + (i - 0.5 * (len(shown) - 1)) * width for k in range(3)]
+        for i, (k, results) in enumerate(shown):
+            x = [at + (i - 0.5 * (len(shown) - 1)) * width for at in range(3)]
             values = [results["push"][horizon][f"{name}_n"] for name in directions]
-            bars = axes.bar(x, values, 0.92 * width, color=color(i, results["label"]), label=results["label"])
+            bars = axes.bar(x, values, 0.92 * width, color=color(k, results["label"]), label=results["label"])
             axes.bar_label(bars, fmt="%.0f", fontsize=7, padding=1)
         axes.set_xticks(range(3), ["forward", "backward", "lateral (worse side)"])
         axes.grid(axis="x", visible=False)
