@@ -130,6 +130,7 @@ class PushConfig:
     force: float = quantity("N", ge=0)
     duration: float = quantity("s", gt=0)
     interval: tuple[float, float] = quantity("s", gt=0)
+    ramp: tuple[float, float] = quantity("samples", ge=0)
 
 
 @dataclass

@@ -83,6 +83,7 @@ class TelebipEnv(VecEnv):
         self._foot_window = zeros(window)
         self._base_lin_vel_b = zeros(3)
         self._energy_share = torch.ones((), device=self.device)
+        self._push_share = torch.ones((), device=self.device)
         self._command_is_fixed = False
 
         self.reset()
@@ -108,6 +109,7 @@ class TelebipEnv(VecEnv):
     def set_progress(self, samples: float) -> None:
         """Bring the curriculum to where a training stands after `samples` environment steps; a new one is complete."""
         self._energy_share.fill_(ramp(samples, self.cfg.reward.energy.ramp))
+        self._push_share.fill_(ramp(samples, self.cfg.disturbance.push.ramp))
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
         """Apply `actions` (num_envs, 6) for one policy step.
@@ -209,7 +211,7 @@ class TelebipEnv(VecEnv):
         if not cfg.enabled:
             return
         interval = uniform((self.num_envs,), *cfg.interval, self.generator)
-        force = sample_pushes(self.num_envs, cfg, self.generator)
+        force = self._push_share * sample_pushes(self.num_envs, cfg, self.generator)
         start = self._push_timer <= 0.0
         self._push_timer.copy_(torch.where(start, interval, self._push_timer) - self.step_dt)
         self._push_time_left.copy_(torch.where(start, cfg.duration, self._push_time_left - self.step_dt))
