@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from types import ModuleType
 
 from telebip import __version__
-from telebip.cli import common, evaluate, export, play, reproduce, train
+from telebip.cli import benchmark, common, evaluate, export, play, reproduce, train
 from telebip.errors import UserError, nearest
 
 COMMANDS: dict[str, ModuleType] = {
@@ -14,6 +14,7 @@ COMMANDS: dict[str, ModuleType] = {
     "evaluate": evaluate,
     "reproduce": reproduce,
     "export": export,
+    "benchmark": benchmark,
 }
 """Name -> module with `main(argv)`; the first line of its docstring is the command's description."""
 

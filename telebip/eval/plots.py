@@ -156,3 +156,21 @@ def learning(all_results: Sequence[Results]) -> Figure:
             axes.set_ylim(bottom=0)
         right.legend()
     return figure
+
+
+def throughput(rows: Sequence[dict[str, Any]], title: str) -> Figure:
+    """Environment steps per second against the number of worlds, as `telebip.rl.benchmark.measure` returns them."""
+    rungs = {"engine": "physics engine alone", "env": "environment", "collect": "with the policy", "train": "training"}
+    worlds = [row["num_envs"] for row in rows]
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(figsize=(7.2, 3.4))
+        for i, (rung, label) in enumerate(rungs.items()):
+            rates = [row[f"{rung}_env_steps_per_s"] for row in rows]
+            axes.plot(worlds, rates, "o-", color=COLORS[i], lw=1.4, ms=4, label=label)
+        axes.set_xscale("log", base=2)
+        axes.set_xticks(worlds, [str(number) for number in worlds])
+        axes.minorticks_off()
+        axes.set(xlabel="worlds", ylabel="environment steps per second", title=title)
+        axes.set_ylim(bottom=0)
+        axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return figure

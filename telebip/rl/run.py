@@ -7,6 +7,7 @@ import sys
 from datetime import datetime
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 from telebip import ROOT, __version__
 from telebip.config import TaskConfig, to_yaml
@@ -43,14 +44,21 @@ def describe_run(run_dir: Path, config: TaskConfig, device: str, backend: str, p
         "device": device,
         "backend": backend,
         "processes": processes,
+        **describe_code(),
+    }
+    file = run_dir / "run.json"
+    starts = json.loads(file.read_text(encoding="utf-8"))["starts"] if file.exists() else []
+    file.write_text(json.dumps({"starts": [*starts, start]}, indent=2) + "\n", encoding="utf-8")
+
+
+def describe_code() -> dict[str, Any]:
+    """Return the git revision and the versions of everything that numbers depend on."""
+    return {
         "git_revision": git_revision(),
         "git_dirty": bool(_git("status", "--porcelain", "--untracked-files=no")),
         "python": platform.python_version(),
         "versions": {"telebip": __version__, **{name: version(name) for name in PACKAGES}},
     }
-    file = run_dir / "run.json"
-    starts = json.loads(file.read_text(encoding="utf-8"))["starts"] if file.exists() else []
-    file.write_text(json.dumps({"starts": [*starts, start]}, indent=2) + "\n", encoding="utf-8")
 
 
 def git_revision() -> str | None:

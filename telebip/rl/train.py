@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
@@ -45,7 +46,7 @@ class Trainer:
             self.learner = FastPPO.construct_algorithm(env.get_observations(), env, self._rsl_rl_cfg(), str(env.device))
         if self.ranks.size > 1:
             self.learner.broadcast_parameters()
-        self._view = SymmetricEnv(env) if ppo.symmetry == "phase" else env
+        self.view = SymmetricEnv(env) if ppo.symmetry == "phase" else env
         self._episodes = EpisodeStatistics(env.num_envs, env.device)
 
     def resume(self, checkpoint: Checkpoint) -> None:
@@ -65,24 +66,19 @@ class Trainer:
             stop: asked after every iteration; one process that says so stops them all.
             report: called after every iteration with what TensorBoard gets.
         """
-        env, view, learner, cfg = self.env, self._view, self.learner, self.env.cfg.ppo
+        env, learner, cfg = self.env, self.learner, self.env.cfg.ppo
         log = RunLog(self.run_dir, self.samples) if self.ranks.is_main else None
         # Spread the time-outs over the iterations.
         ages = torch.randint(env.max_episode_length, (env.num_envs,), generator=env.generator, device=env.device)
         env.episode_length_buf = ages
         learner.train_mode()
-        obs = view.get_observations()
+        obs = self.view.get_observations()
         while self.iteration < cfg.max_iterations and not self.ranks.any(stop(), env.device):
             start = time.perf_counter()
-            logs: dict[str, Tensor] = {}
             env.set_progress(self.samples)
             learner.get_policy().distribution.std_range[0] = min_std(cfg, self.samples)  # type: ignore[union-attr]
             with torch.inference_mode():
-                for _ in range(cfg.num_steps_per_env):
-                    obs, rewards, dones, extras = view.step(learner.act(obs))
-                    learner.process_env_step(obs, rewards, dones, extras)
-                    self._episodes.add(rewards, dones)
-                    logs = {key: logs.get(key, 0) + value for key, value in extras["log"].items()}
+                obs, logs = self.collect(obs)
                 collected = time.perf_counter()
                 learner.compute_returns(obs)
             losses = learner.update()
@@ -114,6 +110,16 @@ class Trainer:
         self.save()
         if log:
             log.close()
+
+    def collect(self, obs: TensorDict) -> tuple[TensorDict, dict[str, Tensor]]:
+        """Act from `obs` for `ppo.num_steps_per_env` steps and store them; return what is seen last, and the logs' sums."""
+        logs: dict[str, Tensor] = {}
+        for _ in range(self.env.cfg.ppo.num_steps_per_env):
+            obs, rewards, dones, extras = self.view.step(self.learner.act(obs))
+            self.learner.process_env_step(obs, rewards, dones, extras)
+            self._episodes.add(rewards, dones)
+            logs = {key: logs.get(key, 0) + value for key, value in extras["log"].items()}
+        return obs, logs
 
     def save(self) -> None:
         """Write `model_<iteration>.pt`, to go on from, and `policy.pt`, the actor alone; the first process does."""

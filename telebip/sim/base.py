@@ -83,6 +83,22 @@ class Simulator(Protocol):
         """
         ...
 
+    @property
+    def buffers(self) -> tuple[Tensor, ...]:
+        """Everything that decides the next step, live: copies written back bring the worlds back to where they were."""
+        ...
+
+    def write(self, targets: Tensor, wrench_w: Tensor) -> None:
+        """Set the inputs of `step`, and do no more; for `advance`."""
+        ...
+
+    def advance(self) -> None:
+        """Run the engine's physics steps of one policy step and nothing else, to measure `step` against.
+
+        The worlds go where `step` with the inputs last written would take them; `state` need not follow.
+        """
+        ...
+
     def reset(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
         """Overwrite the worlds where `mask` (num_envs,) holds with rows of `qpos` (num_envs, 13) and `qvel` (num_envs, 12).
 

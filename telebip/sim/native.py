@@ -42,6 +42,7 @@ class NativeSimulator:
         # A non-finite state stays, to be seen and counted by the environment; the engine would silently reset it.
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self._batch = Batch(model, num_envs, num_threads)
+        self._rows = torch.from_numpy(self._batch.state)
         self._qpos, self._qvel, self._warmstart, self._ctrl, self._time = (
             torch.from_numpy(self._batch.bind(name)) for name in ("qpos", "qvel", "qacc_warmstart", "ctrl", "time")
         )
@@ -56,8 +57,7 @@ class NativeSimulator:
 
     def step(self, targets: Tensor, wrench_w: Tensor) -> SimState:
         """See `Simulator.step`."""
-        self._ctrl.copy_(targets)
-        self._trunk_wrench.copy_(wrench_w)
+        self.write(targets, wrench_w)
         self._batch.rollout(self._decimation, record=tuple(self._record), out=self._record)
         self.state.qpos.copy_(self._qpos)
         self.state.qvel.copy_(self._qvel)
@@ -67,6 +67,20 @@ class NativeSimulator:
         self.state.joint_net_power.copy_(power.mean(1))
         self.state.joint_power.copy_(power.abs_().mean(1))
         return self.state
+
+    @property
+    def buffers(self) -> tuple[Tensor, ...]:
+        """See `Simulator.buffers`."""
+        return self._rows, self.state.qpos, self.state.qvel, *self.state.step_means, *self.model_fields.values()
+
+    def write(self, targets: Tensor, wrench_w: Tensor) -> None:
+        """See `Simulator.write`."""
+        self._ctrl.copy_(targets)
+        self._trunk_wrench.copy_(wrench_w)
+
+    def advance(self) -> None:
+        """See `Simulator.advance`."""
+        self._batch.step(nstep=self._decimation)
 
     def reset(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
         """See `Simulator.reset`."""

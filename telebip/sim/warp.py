@@ -96,20 +96,30 @@ class WarpSimulator:
             wp.to_torch(a) for a in (self._data.ctrl, self._data.qacc_warmstart, self._data.time)
         )
         self._trunk_wrench = wp.to_torch(self._data.xfrc_applied)[:, robot.trunk_id]
-        self._graph = self._capture() if self._wp_device.is_cuda else None
+        self._graphs = {True: self._capture(with_means=True)} if self._wp_device.is_cuda else {}
         home = torch.as_tensor(robot.home_qpos, dtype=torch.float32, device=device).expand(num_envs, -1)
         self.reset(torch.ones(num_envs, dtype=torch.bool, device=device), home, torch.zeros(num_envs, 12, device=device))
 
     def step(self, targets: Tensor, wrench_w: Tensor) -> SimState:
         """See `Simulator.step`."""
+        self.write(targets, wrench_w)
+        self._run(with_means=True)
+        return self.state
+
+    @property
+    def buffers(self) -> tuple[Tensor, ...]:
+        """See `Simulator.buffers`."""
+        inputs = (self._ctrl, self._trunk_wrench, self._warmstart, self._time)
+        return self.state.qpos, self.state.qvel, *inputs, *self.state.step_means, *self.model_fields.values()
+
+    def write(self, targets: Tensor, wrench_w: Tensor) -> None:
+        """See `Simulator.write`."""
         self._ctrl.copy_(targets)
         self._trunk_wrench.copy_(wrench_w)
-        if self._graph is None:
-            self._launch()
-        else:
-            # On torch's stream, so that torch's work before and after is ordered with it without a synchronisation.
-            wp.capture_launch(self._graph, stream=wp.stream_from_torch(torch.cuda.current_stream(self.device)))
-        return self.state
+
+    def advance(self) -> None:
+        """See `Simulator.advance`; on CUDA the first call records a graph, and leaves the worlds some steps further on."""
+        self._run(with_means=False)
 
     def reset(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
         """See `Simulator.reset`."""
@@ -119,13 +129,25 @@ class WarpSimulator:
         for target in (self._warmstart, self._time, *self.state.step_means):
             target.masked_fill_(rows if target.dim() == 2 else mask, 0.0)
 
-    def _launch(self) -> None:
-        """Run the physics steps of one policy step."""
+    def _run(self, with_means: bool) -> None:
+        """Run the physics steps of one policy step: on CUDA as a graph, recorded at its first use."""
+        if not self._wp_device.is_cuda:
+            self._launch(with_means)
+            return
+        if with_means not in self._graphs:
+            self._graphs[with_means] = self._capture(with_means)
+        # On torch's stream, so that torch's work before and after is ordered with it without a synchronisation.
+        wp.capture_launch(self._graphs[with_means], stream=wp.stream_from_torch(torch.cuda.current_stream(self.device)))
+
+    def _launch(self, with_means: bool) -> None:
+        """Run the physics steps of one policy step, and the means over them if asked."""
         with wp.ScopedDevice(self._wp_device):
-            for mean in self._means:
+            for mean in self._means if with_means else ():
                 mean.zero_()
             for _ in range(self._decimation):
                 mjw.step(self._model, self._data)
+                if not with_means:
+                    continue
                 wp.launch(
                     _accumulate,
                     dim=(self.num_envs, 6),
@@ -139,10 +161,11 @@ class WarpSimulator:
                     outputs=self._means,
                 )
 
-    def _capture(self) -> wp.Graph:
+    def _capture(self, with_means: bool) -> wp.Graph:
         """Compile and warm up, then record `_launch` as a CUDA graph."""
-        self._launch()
+        wp.synchronize_device(self._wp_device)
+        self._launch(with_means)
         with wp.ScopedCapture(device=self._wp_device) as capture:
-            self._launch()
+            self._launch(with_means)
         wp.synchronize_device(self._wp_device)  # from here on everything runs on torch's stream
         return capture.graph  # type: ignore[return-value]

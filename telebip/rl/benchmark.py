@@ -1,0 +1,301 @@
+"""Where the time of a training iteration goes, as a ladder: physics engine, environment, collection, training.
+
+A round measures every rung on the same stretch of walking, one after the other in one process: a slow moment of the machine
+hits them all, and their ratios hold where times do not. It first walks the stretch unmeasured and notes down the actions, and
+the worlds and inputs from which every engine step starts. The rungs then go over it again, from the same worlds:
+
+    engine      the engine alone takes the steps that were noted down: same states, contacts, targets, pushes and frictions
+    env         `env.step` with the actions that were noted down
+    collect     policy, `env.step` and storage, as in training
+    learn       returns and update; the weights are put back afterwards, so that every round walks alike
+
+On CUDA the device is waited for at the two ends of a measurement, and not in between.
+"""
+
+import contextlib
+import copy
+import gc
+import platform
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import torch
+from rsl_rl.algorithms import PPO
+from torch import Tensor
+
+from telebip.config import TaskConfig
+from telebip.env import TelebipEnv
+from telebip.errors import UserError
+from telebip.rl.checkpoint import Checkpoint
+from telebip.rl.train import Trainer
+from telebip.robot import Robot
+from telebip.sim import Backend
+
+WARM_UP = 2.0
+"""How long the robots walk before anything is measured [s]."""
+
+Seconds = dict[str, float]
+
+
+class StockTrainer(Trainer):
+    """Trains with rsl-rl's PPO as it stands, in float32."""
+
+    def _rsl_rl_cfg(self) -> dict:
+        cfg = super()._rsl_rl_cfg()
+        cfg["algorithm"] |= {"class_name": PPO, "use_mixed_precision": False}
+        return cfg
+
+
+class Ladder:
+    """The rungs for one number of worlds, in which a trained policy walks."""
+
+    def __init__(
+        self,
+        cfg: TaskConfig,
+        robot: Robot,
+        device: torch.device,
+        backend: Backend,
+        checkpoint: Checkpoint,
+        stock_threads: int = 0,
+    ) -> None:
+        """Create the worlds and let them walk.
+
+        Args:
+            cfg: the task; `num_envs` is the number of worlds.
+            robot: from `telebip.robot.load_robot(cfg.sim.robot)`.
+            device: where to measure.
+            backend: physics engine, see `telebip.sim.make_simulator`.
+            checkpoint: of the policy that walks.
+            stock_threads: threads of torch with which rsl-rl's own PPO is measured too; 0 leaves it out.
+
+        Raises:
+            UserError: the policy does not fit the task.
+        """
+        before = allocated_bytes(device)
+        self.env = TelebipEnv(cfg, robot, device, backend)
+        self._trainer = Trainer(self.env, "", Path())
+        actor = self._trainer.learner.actor
+        try:
+            actor.load_state_dict(checkpoint.learner["actor_state_dict"])
+        except (RuntimeError, KeyError) as error:
+            raise UserError(f"checkpoint '{checkpoint.path}' holds no weights that fit the task's policy") from error
+        self._weights = copy.deepcopy(self._trainer.learner.save())
+        self._trainer.learner.train_mode()
+        env = self.env
+        env.episode_length_buf = torch.randint(env.max_episode_length, (env.num_envs,), generator=env.generator, device=device)
+        with torch.inference_mode():
+            obs = self._trainer.view.get_observations()
+            for _ in range(round(WARM_UP / env.step_dt)):
+                obs = self._trainer.view.step(actor(obs))[0]
+        self._iteration(self._trainer)  # allocates what an iteration needs
+        self.bytes_per_env = (allocated_bytes(device) - before) / cfg.num_envs
+        self._stock_threads = stock_threads
+        self._stock = StockTrainer(env, "", Path()) if stock_threads else None
+        if self._stock:
+            self._stock.learner.train_mode()
+
+    @property
+    def batch(self) -> int:
+        """Environment steps in a round."""
+        return self.env.num_envs * self.env.cfg.ppo.num_steps_per_env
+
+    @property
+    def uses_bfloat16(self) -> bool:
+        """Whether the update does, in telebip's own training."""
+        return self._trainer.learner.use_mixed_precision
+
+    def round(self) -> Seconds:
+        """Measure every rung once, and walk on."""
+        env, learner = self.env, self._trainer.learner
+        start = snapshot(env)
+        seed = torch.seed()
+        with recorded(env) as (actions, states), torch.inference_mode():
+            self._trainer.collect(self._trainer.view.get_observations())
+        learner.storage.clear()
+
+        seconds = {"engine": 0.0}
+        for state in states:
+            write_back(env.sim.buffers, state)
+            seconds["engine"] += self._timed(env.sim.advance)
+        states.clear()
+        restore(env, start)
+        with torch.inference_mode():
+            env.get_observations()  # as before: the draws go on from there
+            seconds["env"] = self._timed(lambda: [env.step(action)[2] for action in actions])
+        if self._stock:
+            restore(env, start)
+            torch.manual_seed(seed)
+            threads = torch.get_num_threads()
+            torch.set_num_threads(self._stock_threads)
+            seconds |= {f"stock_{rung}": value for rung, value in self._iteration(self._stock).items()}
+            torch.set_num_threads(threads)
+        restore(env, start)
+        torch.manual_seed(seed)
+        return seconds | self._iteration(self._trainer)
+
+    def _iteration(self, trainer: Trainer) -> Seconds:
+        """Run one training iteration from the policy's weights; return how long collecting and learning took."""
+        learner = trainer.learner
+        learner.load(copy.deepcopy(self._weights), load_cfg=None, strict=True)
+        with torch.inference_mode():
+            obs = trainer.view.get_observations()
+
+            def collect() -> None:
+                nonlocal obs
+                obs = trainer.collect(obs)[0]
+
+            collect_seconds = self._timed(collect)
+
+        def learn() -> None:
+            with torch.inference_mode():
+                learner.compute_returns(obs)
+            learner.update()
+
+        return {"collect": collect_seconds, "learn": self._timed(learn)}
+
+    def _timed(self, function: Callable[[], Any]) -> float:
+        """Return how long a call took, from an idle device to an idle device [s]."""
+        self._synchronize()
+        start = time.perf_counter()
+        function()
+        self._synchronize()
+        return time.perf_counter() - start
+
+    def _synchronize(self) -> None:
+        if self.env.device.type == "cuda":
+            torch.cuda.synchronize(self.env.device)
+
+
+def measure(
+    cfg: TaskConfig,
+    robot: Robot,
+    device: torch.device,
+    backend: Backend,
+    checkpoint: Checkpoint,
+    rounds: int,
+    stock_threads: int = 0,
+    progress: Callable[[], None] = lambda: None,
+) -> dict[str, Any]:
+    """Return a row of the benchmark's table, ready for JSON: `summary`, bytes, and every round's seconds.
+
+    Measured are `rounds` rounds of a `Ladder`, after a slower one that is not; `progress` is called after each of them.
+
+    Raises:
+        UserError: the policy does not fit the task, or the worlds do not fit the memory.
+    """
+    try:
+        ladder = Ladder(cfg, robot, device, backend, checkpoint, stock_threads)
+        seconds = []
+        for _ in range(rounds + 1):
+            seconds.append(ladder.round())
+            progress()
+    except torch.OutOfMemoryError as error:
+        raise UserError(f"{cfg.num_envs} worlds do not fit into the memory of {device}") from error
+    return {
+        "backend": type(ladder.env.sim).__name__.removesuffix("Simulator").lower(),
+        "device": str(device),
+        "num_envs": cfg.num_envs,
+        "update": "bfloat16" if ladder.uses_bfloat16 else "float32",
+        **summary(seconds[1:], ladder.batch),
+        "bytes_per_env": round(ladder.bytes_per_env),
+        "env_steps_per_round": ladder.batch,
+        "rounds_s": seconds[1:],
+    }
+
+
+def summary(rounds: list[Seconds], batch: int) -> dict[str, float]:
+    """Return a table row of rounds of `batch` environment steps each: medians over the rounds of rates and of ratios."""
+
+    def rate(*rungs: str) -> float:
+        return batch / median(sum(seconds[rung] for rung in rungs) for seconds in rounds)
+
+    row = {
+        "engine_env_steps_per_s": rate("engine"),
+        "env_env_steps_per_s": rate("env"),
+        "env_over_engine": median(seconds["engine"] / seconds["env"] for seconds in rounds),
+        "collect_env_steps_per_s": rate("collect"),
+        "learn_env_steps_per_s": rate("learn"),
+        "train_env_steps_per_s": rate("collect", "learn"),
+    }
+    if "stock_learn" in rounds[0]:
+        row["stock_train_env_steps_per_s"] = rate("stock_collect", "stock_learn")
+        row["train_over_stock"] = median(
+            (seconds["stock_collect"] + seconds["stock_learn"]) / (seconds["collect"] + seconds["learn"]) for seconds in rounds
+        )
+    return row
+
+
+@contextmanager
+def recorded(env: TelebipEnv) -> Iterator[tuple[list[Tensor], list[list[Tensor]]]]:
+    """Note down the actions of each `env.step`, and the simulator's buffers, inputs included, at its call of the engine."""
+    actions: list[Tensor] = []
+    states: list[list[Tensor]] = []
+    step, advance = env.step, env.sim.step
+
+    def env_step(action: Tensor):
+        actions.append(action.clone())
+        return step(action)
+
+    def sim_step(targets: Tensor, wrench_w: Tensor):
+        env.sim.write(targets, wrench_w)
+        states.append([buffer.clone() for buffer in env.sim.buffers])
+        return advance(targets, wrench_w)
+
+    env.step, env.sim.step = env_step, sim_step
+    try:
+        yield actions, states
+    finally:
+        del env.step, env.sim.step
+
+
+def allocated_bytes(device: torch.device) -> int:
+    """Return the bytes that stay allocated on `device`: what its tensors cover, on CUDA all that is not free."""
+    gc.collect()
+    if device.type == "cuda":
+        torch.cuda.empty_cache()
+        free, total = torch.cuda.mem_get_info(device)
+        return total - free
+    storages = [x.untyped_storage() for x in gc.get_objects() if issubclass(type(x), Tensor) and x.device == device]
+    covered = end = 0
+    for low, high in sorted((s.data_ptr(), s.data_ptr() + s.nbytes()) for s in storages):  # views of one array overlap
+        covered += max(0, high - max(low, end))
+        end = max(end, high)
+    return covered
+
+
+def machine_name(device: torch.device) -> str:
+    """Return what the device calls itself."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    with contextlib.suppress(OSError):  # Linux; elsewhere platform knows
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+        if names:
+            return names[0]
+    return platform.processor() or platform.machine()
+
+
+def snapshot(env: TelebipEnv) -> tuple[list[Tensor], Tensor]:
+    """Return copies of all that decides how an environment goes on: buffers and the generator's state."""
+    return [buffer.clone() for buffer in _buffers(env)], env.generator.get_state()
+
+
+def restore(env: TelebipEnv, taken: tuple[list[Tensor], Tensor]) -> None:
+    """Bring an environment back to where it was."""
+    buffers, generator = taken
+    write_back(_buffers(env), buffers)
+    env.generator.set_state(generator)
+
+
+def write_back(buffers: Sequence[Tensor], values: Sequence[Tensor]) -> None:
+    """Copy values into live buffers."""
+    for buffer, value in zip(buffers, values, strict=True):
+        buffer.copy_(value)
+
+
+def _buffers(env: TelebipEnv) -> tuple[Tensor, ...]:
+    return *(value for value in vars(env).values() if isinstance(value, Tensor)), *env.sim.buffers

@@ -1,0 +1,71 @@
+"""The benchmark measures what it says: every rung goes over the same walk."""
+
+from itertools import pairwise
+
+import pytest
+import torch
+from worlds import MakeEnv, put_low, random_actions
+
+from telebip.rl.benchmark import allocated_bytes, recorded, restore, snapshot, summary, write_back
+
+
+def test_a_recorded_walk_can_be_gone_over_again(make_env: MakeEnv) -> None:
+    env = make_env("disturbance.push.interval=[0.02,0.06]", num_envs=8)
+    put_low(env, [2])  # it falls at the first step, and starts anew
+    start = snapshot(env)
+    with recorded(env) as (actions, states):
+        walked = [env.step(action)[0]["policy"] for action in random_actions(6, 8, 0.3)]
+    assert (len(actions), len(states)) == (6, 6)
+    assert "step" not in vars(env) and "step" not in vars(env.sim)
+
+    restore(env, start)
+    again = [env.step(action)[0]["policy"] for action in actions]
+    assert all(torch.equal(a, b) for a, b in zip(walked, again, strict=True))
+
+    others = [0, 1, 3, 4, 5, 6, 7]  # worlds that are not reset go from each recorded state to the next
+    qpos = slice(1, 14)  # in a row of MuJoCo's integration state, after the time
+    for state, following in pairwise(states):
+        write_back(env.sim.buffers, state)
+        env.sim.advance()
+        assert torch.equal(env.sim.buffers[0][others, qpos], following[0][others, qpos])
+
+
+def test_the_summary_is_made_of_medians_over_the_rounds() -> None:
+    rounds = [
+        {"engine": 1.0, "env": 2.0, "collect": 3.0, "learn": 1.0, "stock_collect": 4.0, "stock_learn": 4.0},
+        {"engine": 1.0, "env": 1.0, "collect": 2.0, "learn": 2.0, "stock_collect": 4.0, "stock_learn": 2.0},
+        {"engine": 9.0, "env": 10.0, "collect": 10.0, "learn": 10.0, "stock_collect": 10.0, "stock_learn": 10.0},
+    ]
+    assert summary(rounds, 60) == {
+        "engine_env_steps_per_s": 60.0,
+        "env_env_steps_per_s": 30.0,
+        "env_over_engine": 0.9,  # of 0.5, 1 and 0.9
+        "collect_env_steps_per_s": 20.0,
+        "learn_env_steps_per_s": 30.0,
+        "train_env_steps_per_s": 15.0,
+        "stock_train_env_steps_per_s": 7.5,
+        "train_over_stock": 1.5,
+    }
+    assert "train_over_stock" not in summary([{"engine": 1.0, "env": 1.0, "collect": 1.0, "learn": 1.0}], 1)
+
+
+def test_bytes_are_counted_once() -> None:
+    cpu = torch.device("cpu")
+    before = allocated_bytes(cpu)
+    array = torch.zeros(1000, 30).numpy()  # 4 bytes each
+    views = [torch.from_numpy(array[:, part]) for part in (slice(0, 20), slice(10, 30))]
+    assert allocated_bytes(cpu) - before == 120_000
+    del views, array
+    assert allocated_bytes(cpu) == before
+
+
+@pytest.mark.parametrize("backend", ["native", "warp"])
+def test_a_step_leaves_no_memory_behind(make_env: MakeEnv, backend: str) -> None:
+    env = make_env("episode.length=0.06", num_envs=16, backend=backend)
+    held = []
+    for _ in range(3):
+        for action in random_actions(5, 16):
+            env.step(action)
+        del action
+        held.append(allocated_bytes(torch.device("cpu")))
+    assert held[0] == held[1] == held[2]
