@@ -66,7 +66,7 @@ class TelebipEnv(VecEnv):
         self._action_scale = constant([cfg.action.hip_roll, cfg.action.hip_pitch, cfg.action.knee] * 2)
         self._noise_amplitude = constant(noise_amplitude(cfg.disturbance.noise))
         self._foot_weights = constant(gait.window_weights(window, cfg.reward.foot.gamma, cfg.reward.foot.first))
-        self._friction = self.sim.model_fields["geom_friction"][:, robot.floor_id, 0]  # live, one per world
+        self._friction = self.sim.model_fields["geom_friction"][:, robot.engine_floor_id, 0]  # live, one per world
 
         self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)  # policy steps since reset
         self.last_action = zeros(6)

@@ -241,7 +241,7 @@ def test_switched_off_disturbances_are_exactly_absent(make_env: MakeEnv, robot: 
         env.step(action)
         assert not env.push_wrench_w.any()
         assert torch.equal(observe(env), observe(env))
-    expected = torch.as_tensor(robot.model.geom_friction).to(friction).expand_as(friction)
+    expected = torch.as_tensor(robot.engine_model.geom_friction).to(friction).expand_as(friction)
     assert torch.equal(friction, expected)
 
 
@@ -271,7 +271,7 @@ def test_noise_does_not_reach_the_rewards(make_env: MakeEnv) -> None:
 
 def test_friction_is_drawn_per_world_and_episode(make_env: MakeEnv, robot: Robot) -> None:
     env = make_env("disturbance.friction.range=[0.3,0.9]", num_envs=8)
-    friction = env.sim.model_fields["geom_friction"][:, robot.floor_id, 0]
+    friction = env.sim.model_fields["geom_friction"][:, robot.engine_floor_id, 0]
     first = friction.clone()
     assert len(first.unique()) == 8
     assert ((first >= 0.3) & (first <= 0.9)).all()

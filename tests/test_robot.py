@@ -107,6 +107,17 @@ def test_home_pose_touches_the_ground_and_stands(robot: Robot) -> None:
     assert force.sum() == pytest.approx(13.6 * 9.81, rel=0.02)
 
 
+def test_the_engines_model_has_the_same_bodies_and_only_what_the_physics_needs(robot: Robot) -> None:
+    """That it moves the same, bit for bit, is in tests/sim/test_conformance.py."""
+    model, engine = robot.model, robot.engine_model
+    assert [engine.geom(i).name for i in range(engine.ngeom)] == ["floor", "trunk", "right_foot", "left_foot"]
+    assert [engine.sensor(i).name for i in range(engine.nsensor)] == ["right_foot_force", "left_foot_force"]
+    assert (engine.nq, engine.nv, engine.nu, engine.nbody) == (model.nq, model.nv, model.nu, model.nbody)
+    for name in ("body_mass", "body_inertia", "body_ipos", "body_iquat", "dof_armature", "dof_invweight0", "jnt_range"):
+        np.testing.assert_array_equal(getattr(engine, name), getattr(model, name), err_msg=name)
+    assert engine.geom(robot.engine_floor_id).name == "floor"
+
+
 def test_robot_is_its_own_mirror_image(robot: Robot) -> None:
     model = robot.model
     for part in PARTS:

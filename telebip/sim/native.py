@@ -37,8 +37,8 @@ class NativeSimulator:
         self.device = torch.device("cpu")
         self.state = SimState.zeros(num_envs, self.device)
         self._decimation = decimation
-        self._foot_adr = list(robot.foot_sensor_adr)
-        model = copy.copy(robot.model)
+        self._foot_adr = list(robot.engine_foot_sensor_adr)
+        model = copy.copy(robot.engine_model)
         # A non-finite state stays, to be seen and counted by the environment; the engine would silently reset it.
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self._batch = Batch(model, num_envs, num_threads)

@@ -66,19 +66,19 @@ class WarpSimulator:
         self.num_envs = num_envs
         self.device = device
         self._decimation = decimation
-        self._foot_adr = robot.foot_sensor_adr
+        self._foot_adr = robot.engine_foot_sensor_adr
         wp.config.log_level = wp.LOG_WARNING  # not a line for each of a hundred kernels
         wp.init()
         self._wp_device = wp.device_from_torch(device)
         with wp.ScopedDevice(self._wp_device):
-            self._model = mjw.put_model(robot.model, batch_sizes=dict.fromkeys(model_fields, num_envs))
+            self._model = mjw.put_model(robot.engine_model, batch_sizes=dict.fromkeys(model_fields, num_envs))
             # The MJCF's limits on solver iterations are meant; exceeded capacities still print.
             self._model.opt.warn_overflow &= ~(mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS)
-            self._data = mjw.make_data(robot.model, nworld=num_envs, nconmax=MAX_CONTACTS, njmax=MAX_CONSTRAINTS)
+            self._data = mjw.make_data(robot.engine_model, nworld=num_envs, nconmax=MAX_CONTACTS, njmax=MAX_CONSTRAINTS)
         self.model_fields = {name: wp.to_torch(getattr(self._model, name)) for name in model_fields}
         for name, field in self.model_fields.items():
             field.copy_(
-                torch.as_tensor(getattr(robot.model, name), dtype=field.dtype).reshape(field.shape[1:]).expand_as(field)
+                torch.as_tensor(getattr(robot.engine_model, name), dtype=field.dtype).reshape(field.shape[1:]).expand_as(field)
             )
         self.state = SimState(
             qpos=wp.to_torch(self._data.qpos),

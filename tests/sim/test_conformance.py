@@ -250,8 +250,8 @@ def test_friction_is_per_world_and_acts(make: Make, backend: tuple[Backend, str]
     sim = make(num_envs=3, model_fields=("geom_friction",))
     field = sim.model_fields["geom_friction"]
     for world in field.cpu():
-        torch.testing.assert_close(world, torch.as_tensor(robot.model.geom_friction).to(world), rtol=0.0, atol=0.0)
-    field[:, robot.floor_id, 0] = torch.tensor(friction, dtype=field.dtype, device=field.device)
+        torch.testing.assert_close(world, torch.as_tensor(robot.engine_model.geom_friction).to(world), rtol=0.0, atol=0.0)
+    field[:, robot.engine_floor_id, 0] = torch.tensor(friction, dtype=field.dtype, device=field.device)
     models = []
     for value in friction:
         model = copy.copy(robot.model)
