@@ -9,11 +9,11 @@ from telebip.config import TaskConfig
 from telebip.math import rotate_inverse, wrap_angle, yaw
 from telebip.mdp import gait, terminations
 from telebip.mdp.actions import joint_targets
-from telebip.mdp.commands import hold_heading, sample_commands
+from telebip.mdp.commands import hold_heading
 from telebip.mdp.context import StepContext
 from telebip.mdp.curriculum import ramp
 from telebip.mdp.observations import heading_relative_quat, noise_amplitude, observation
-from telebip.mdp.randomization import initial_state, sample_pushes, uniform
+from telebip.mdp.randomization import Draws, initial_qpos, push_force, ranges, uniform
 from telebip.mdp.rewards import reward_terms
 from telebip.robot import Robot
 from telebip.sim import Backend, make_simulator
@@ -64,6 +64,7 @@ class TelebipEnv(VecEnv):
         window = gait.window_length(cfg.gait.period, self.step_dt)
         self._home_qpos, self._nominal, self._force_limit = map(constant, (robot.home_qpos, robot.nominal, robot.force_limit))
         self._action_scale = constant([cfg.action.hip_roll, cfg.action.hip_pitch, cfg.action.knee] * 2)
+        self._draws = Draws(ranges(cfg), self.device)
         self._noise_amplitude = constant(noise_amplitude(cfg.disturbance.noise))
         self._foot_weights = constant(gait.window_weights(window, cfg.reward.foot.gamma, cfg.reward.foot.first))
         self._friction = self.sim.model_fields["geom_friction"][:, robot.engine_floor_id, 0]  # live, one per world
@@ -90,10 +91,11 @@ class TelebipEnv(VecEnv):
 
     def reset(self) -> TensorDict:
         """Start a new episode in every world and return its observation."""
-        self._reset(torch.ones(self.num_envs, dtype=torch.bool, device=self.device))
+        draws = self._draws.draw(self.num_envs, self.generator)
+        self._reset(torch.ones(self.num_envs, dtype=torch.bool, device=self.device), draws)
         state = self.sim.state
         self._base_lin_vel_b.copy_(rotate_inverse(state.base_quat, state.base_lin_vel_w))
-        self._update_commands()
+        self._update_commands(draws)
         return self.get_observations()
 
     def set_command(self, lin_vel_x: float, lin_vel_y: float, ang_vel_z: float) -> None:
@@ -104,7 +106,7 @@ class TelebipEnv(VecEnv):
         """Give each world its row of `commands` (num_envs, 3) [m/s, m/s, rad/s], for good."""
         self._command_is_fixed = True
         self.target_command.copy_(commands)
-        self._update_commands()
+        self._hold_heading()
 
     def set_progress(self, samples: float) -> None:
         """Bring the curriculum to where a training stands after `samples` environment steps; a new one is complete."""
@@ -126,7 +128,8 @@ class TelebipEnv(VecEnv):
             raise ValueError(f"actions must have shape {(self.num_envs, self.num_actions)}, got {tuple(actions.shape)}")
         cfg = self.cfg
         # 1. Physics: hold the joint targets for `decimation` steps of the engine.
-        self._update_pushes()
+        draws = self._draws.draw(self.num_envs, self.generator)
+        self._update_pushes(draws)
         self.joint_target.copy_(joint_targets(actions, self._nominal, self._action_scale))
         state = self.sim.step(self.joint_target, self.push_wrench_w)
 
@@ -170,9 +173,9 @@ class TelebipEnv(VecEnv):
         if self._keep_final_obs:
             self._hold_heading()
             extras["final_obs"] = self.get_observations()
-        self._reset(dones)
+        self._reset(dones, draws)
         self._base_lin_vel_b.copy_(rotate_inverse(state.base_quat, state.base_lin_vel_w))
-        self._update_commands()
+        self._update_commands(draws)
         return self.get_observations(), rewards, dones, extras
 
     def get_observations(self) -> TensorDict:
@@ -189,43 +192,40 @@ class TelebipEnv(VecEnv):
         """Phase signals (p_r, p_l) at the present time, (num_envs, 2)."""
         return gait.phase_signals(self.episode_length_buf * self.step_dt, self.cfg.gait.period)
 
-    def _reset(self, mask: Tensor) -> None:
+    def _reset(self, mask: Tensor, draws: dict[str, Tensor]) -> None:
         """Start a new episode in the worlds where `mask` (num_envs,) holds."""
-        cfg, rows = self.cfg, mask[:, None]
-        qpos, qvel = initial_state(self._home_qpos, self.num_envs, cfg.episode, self.generator)
-        self.sim.reset(mask, qpos, qvel)
-        if cfg.disturbance.friction.enabled:
-            friction = uniform((self.num_envs,), *cfg.disturbance.friction.range, self.generator)
-            self._friction.copy_(torch.where(mask, friction.to(self._friction.dtype), self._friction))
-        push_interval = uniform((self.num_envs,), *cfg.disturbance.push.interval, self.generator)
-        self._push_timer.copy_(torch.where(mask, push_interval, self._push_timer))
-        self.reference_heading.copy_(torch.where(mask, yaw(self.sim.state.base_quat), self.reference_heading))
+        heading = draws["heading"]
+        self.sim.reset(mask, initial_qpos(self._home_qpos, draws["joint_offset"], heading), draws["qvel"])
+        if self.cfg.disturbance.friction.enabled:
+            torch.where(mask, draws["friction"][:, 0], self._friction, out=self._friction)
+        torch.where(mask, draws["push_interval"][:, 0], self._push_timer, out=self._push_timer)
+        torch.where(mask, heading[:, 0], self.reference_heading, out=self.reference_heading)
         for buffer in (self.episode_length_buf, self._command_timer):
             buffer.masked_fill_(mask, 0)
         for buffer in (self.last_action, self._foot_window, self.push_wrench_w):
-            buffer.masked_fill_(rows, 0.0)
+            buffer.masked_fill_(mask[:, None], 0.0)
 
-    def _update_pushes(self) -> None:
+    def _update_pushes(self, draws: dict[str, Tensor]) -> None:
         """Start a push where its time has come and end it after its duration. The timer counts down to the next start."""
         cfg = self.cfg.disturbance.push
         if not cfg.enabled:
             return
-        interval = uniform((self.num_envs,), *cfg.interval, self.generator)
-        force = self._push_share * sample_pushes(self.num_envs, cfg, self.generator)
+        force = self._push_share * push_force(draws["push"])
         start = self._push_timer <= 0.0
-        self._push_timer.copy_(torch.where(start, interval, self._push_timer) - self.step_dt)
-        self._push_time_left.copy_(torch.where(start, cfg.duration, self._push_time_left - self.step_dt))
+        torch.where(start, draws["push_interval"][:, 0], self._push_timer, out=self._push_timer)
+        self._push_timer -= self.step_dt
+        self._push_time_left -= self.step_dt
+        self._push_time_left.masked_fill_(start, cfg.duration)
         kept = torch.where(start[:, None], force, self.push_wrench_w[:, :2])
         self.push_wrench_w[:, :2] = kept.masked_fill(self._push_time_left[:, None] < 0.5 * self.step_dt, 0.0)
 
-    def _update_commands(self) -> None:
-        """Draw a new command where the last one has expired, and bring the heading hold up to date."""
+    def _update_commands(self, draws: dict[str, Tensor]) -> None:
+        """Give a new command where the last one has expired, and bring the heading hold up to date."""
         cfg = self.cfg.command
         if not self._command_is_fixed:
-            new = sample_commands(self.num_envs, cfg, self.generator)
             due = self._command_timer < 0.5 * self.step_dt
-            self.target_command.copy_(torch.where(due[:, None], new, self.target_command))
-            self._command_timer.copy_(torch.where(due, cfg.resampling_time, self._command_timer))
+            torch.where(due[:, None], draws["command"], self.target_command, out=self.target_command)
+            self._command_timer.masked_fill_(due, cfg.resampling_time)
         self._hold_heading()
 
     def _hold_heading(self) -> None:

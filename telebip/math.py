@@ -52,6 +52,16 @@ def quat_from_yaw(angle: Tensor) -> Tensor:
     return torch.stack([torch.cos(half), zero, zero, torch.sin(half)], dim=-1)
 
 
+def turn(quat: Tensor, angle: Tensor) -> Tensor:
+    """Return `quat` (..., 4) turned about the world's z axis by `angle` [rad] (...): q_z q, with q_z of half the angle.
+
+    (c, 0, 0, s) q = c (w, x, y, z) + s (-z, -y, x, w)
+    """
+    half = 0.5 * angle[..., None]
+    w, x, y, z = quat.unbind(-1)
+    return torch.cos(half) * quat + torch.sin(half) * torch.stack([-z, -y, x, w], dim=-1)
+
+
 def wrap_angle(angle: Tensor) -> Tensor:
     """Return `angle` [rad] wrapped to [-pi, pi)."""
     return torch.remainder(angle + torch.pi, 2.0 * torch.pi) - torch.pi

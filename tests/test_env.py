@@ -329,14 +329,16 @@ def test_the_same_seed_gives_the_same_numbers_and_another_does_not(make_env: Mak
     assert ended > 0  # resets are part of it
 
 
-def test_a_step_reads_nothing_back_to_the_host(make_env: MakeEnv) -> None:
+@pytest.mark.parametrize("backend", ["native", "warp"])
+def test_a_step_reads_nothing_back_to_the_host(make_env: MakeEnv, backend: str) -> None:
     with HostReads() as control:
         torch.ones(3).sum().item()
         torch.nonzero(torch.ones(3))
         torch.ones(3)[torch.tensor([True, False, True])]
     assert control.seen == ["_local_scalar_dense", "nonzero", "index"]
 
-    env = make_env("episode.length=0.06", "command.resampling_time=0.04", "disturbance.push.interval=[0.02,0.02]")
+    ends = ("episode.length=0.06", "command.resampling_time=0.04", "disturbance.push.interval=[0.02,0.02]")
+    env = make_env(*ends, backend=backend)
     with HostReads() as reads:
         for action in random_actions(8, 4):
             env.step(action)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from telebip.math import quat_from_yaw, quat_mul, rotate_inverse, wrap_angle, yaw
+from telebip.math import quat_from_yaw, quat_mul, rotate_inverse, turn, wrap_angle, yaw
 
 HALF = math.sqrt(0.5)
 IDENTITY = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
@@ -160,3 +160,10 @@ def test_wrapped_angle_is_the_same_direction_within_half_a_turn(angle: float) ->
     assert abs(wrapped) <= math.pi
     assert math.cos(wrapped) == pytest.approx(math.cos(angle), abs=1e-9)
     assert math.sin(wrapped) == pytest.approx(math.sin(angle), abs=1e-9)
+
+
+@few
+@given(seeds, angles)
+def test_turning_is_a_product_with_a_rotation_about_z(seed: int, angle: float) -> None:
+    quat, about_z = random_quats(seed), torch.full((4,), angle, dtype=torch.float64)
+    torch.testing.assert_close(turn(quat, about_z), quat_mul(quat_from_yaw(about_z), quat))

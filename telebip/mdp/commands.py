@@ -1,17 +1,9 @@
-"""Velocity commands and the reference heading."""
+"""The heading hold of the velocity command."""
 
 import torch
 from torch import Tensor
 
-from telebip.config import CommandConfig
 from telebip.math import wrap_angle
-from telebip.mdp.randomization import uniform
-
-
-def sample_commands(num_envs: int, cfg: CommandConfig, generator: torch.Generator) -> Tensor:
-    """Draw (vx, vy, yaw rate) uniformly from the configured ranges [m/s, m/s, rad/s], (num_envs, 3)."""
-    ranges = (cfg.lin_vel_x, cfg.lin_vel_y, cfg.ang_vel_z)
-    return torch.stack([uniform((num_envs,), low, high, generator) for low, high in ranges], dim=1)
 
 
 def hold_heading(command: Tensor, heading: Tensor, reference: Tensor, gain: float, limit: float) -> Tensor:

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from telebip.config import NoiseConfig
-from telebip.math import quat_from_yaw, quat_mul
+from telebip.math import turn
 from telebip.sim.base import SimState
 
 LAYOUT: dict[str, int] = {
@@ -35,7 +35,7 @@ def heading_relative_quat(base_quat: Tensor, reference_heading: Tensor) -> Tenso
     Returns:
         Unit quaternion w x y z, (num_envs, 4); q and -q are the same rotation and give the same result.
     """
-    quat = quat_mul(quat_from_yaw(-reference_heading), base_quat)
+    quat = turn(base_quat, -reference_heading)
     return torch.where(quat[:, :1] < 0.0, -quat, quat)
 
 

@@ -1,14 +1,59 @@
-"""Random draws: initial states, pushes, ground friction. All from one seeded generator per environment."""
+"""Random draws: initial states, pushes, ground friction, commands. All from one seeded generator per environment."""
 
 import math
 
 import torch
 from torch import Tensor
 
-from telebip.config import EpisodeConfig, PushConfig
+from telebip.config import TaskConfig
 from telebip.math import quat_from_yaw
 
 KNEES = slice(2, None, 3)
+
+Ranges = dict[str, list[tuple[float, float]]]
+
+
+def ranges(cfg: TaskConfig) -> Ranges:
+    """Return what a step may draw for a world, and the bounds of each of its numbers."""
+    episode, push, command = cfg.episode, cfg.disturbance.push, cfg.command
+
+    def symmetric(size: int, amplitude: float) -> list[tuple[float, float]]:
+        return [(-amplitude, amplitude)] * size
+
+    return {
+        "joint_offset": symmetric(6, episode.reset_joint_pos),  # from the home pose [rad | m]
+        "heading": symmetric(1, episode.reset_heading),  # [rad]
+        "qvel": [  # [m/s, rad/s, rad/s | m/s]
+            *symmetric(2, episode.reset_lin_vel),
+            (0.0, 0.0),
+            *symmetric(3, episode.reset_ang_vel),
+            *symmetric(6, episode.reset_joint_vel),
+        ],
+        "friction": [cfg.disturbance.friction.range],
+        "push_interval": [push.interval],  # [s]
+        "push": [(0.0, push.force), (-math.pi, math.pi)],  # magnitude [N], direction [rad]
+        "command": [command.lin_vel_x, command.lin_vel_y, command.ang_vel_z],  # [m/s, m/s, rad/s]
+    }
+
+
+class Draws:
+    """Draws numbers, uniform in their ranges, for all worlds at once.
+
+    Every world gets its own numbers at every step, needed or not, so that shapes are static and what happens to one world
+    changes nothing for the others.
+    """
+
+    def __init__(self, ranges: Ranges, device: torch.device) -> None:
+        """Put the bounds of `ranges` on `device`."""
+        self._sizes = {name: len(bounds) for name, bounds in ranges.items()}
+        self._low, high = torch.tensor([bound for bounds in ranges.values() for bound in bounds], device=device).unbind(1)
+        self._span = high - self._low
+
+    def draw(self, num_envs: int, generator: torch.Generator) -> dict[str, Tensor]:
+        """Return name -> (num_envs, size) for every range."""
+        unit = torch.rand(num_envs, len(self._span), generator=generator, device=generator.device)
+        parts = torch.addcmul(self._low, self._span, unit).split(list(self._sizes.values()), dim=1)
+        return dict(zip(self._sizes, parts, strict=True))
 
 
 def uniform(shape: tuple[int, ...], low: float, high: float, generator: torch.Generator) -> Tensor:
@@ -16,37 +61,26 @@ def uniform(shape: tuple[int, ...], low: float, high: float, generator: torch.Ge
     return low + (high - low) * torch.rand(shape, generator=generator, device=generator.device)
 
 
-def initial_state(home_qpos: Tensor, num_envs: int, cfg: EpisodeConfig, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Draw standing states about the home pose, with small velocities and any heading.
+def initial_qpos(home_qpos: Tensor, joint_offset: Tensor, heading: Tensor) -> Tensor:
+    """Return standing positions about the home pose.
 
     Where a leg comes out longer than at home, the robot is lifted by the difference, so that no foot starts in the ground. (A
     rotary knee is taken for one that lengthens the leg by 1 m per rad: more than it does.)
 
     Args:
         home_qpos: (13,).
-        num_envs: number of states.
-        cfg: amplitudes.
-        generator: source of randomness.
+        joint_offset: joint positions from home [rad | m], (num_envs, 6).
+        heading: [rad], (num_envs, 1).
 
     Returns:
-        qpos (num_envs, 13) and qvel (num_envs, 12), as in `SimState`.
+        qpos (num_envs, 13), as in `SimState`.
     """
-
-    def symmetric(size: int, amplitude: float) -> Tensor:
-        return uniform((num_envs, size), -amplitude, amplitude, generator)
-
-    joint_offset = symmetric(6, cfg.reset_joint_pos)
-    lift = (-joint_offset[:, KNEES]).amax(dim=1).clamp(min=0.0)
-    position = home_qpos[:3].repeat(num_envs, 1)
-    position[:, 2] += lift
-    heading = quat_from_yaw(symmetric(1, cfg.reset_heading)[:, 0])
-    qpos = torch.cat([position, heading, home_qpos[7:] + joint_offset], dim=1)
-    lin_vel = torch.cat([symmetric(2, cfg.reset_lin_vel), torch.zeros_like(lift)[:, None]], dim=1)
-    return qpos, torch.cat([lin_vel, symmetric(3, cfg.reset_ang_vel), symmetric(6, cfg.reset_joint_vel)], dim=1)
+    lift = -joint_offset[:, KNEES].amin(dim=1, keepdim=True).clamp(max=0.0)
+    x_y = home_qpos[:2].expand(len(lift), -1)
+    return torch.cat([x_y, home_qpos[2] + lift, quat_from_yaw(heading[:, 0]), home_qpos[7:] + joint_offset], dim=1)
 
 
-def sample_pushes(num_envs: int, cfg: PushConfig, generator: torch.Generator) -> Tensor:
-    """Draw horizontal forces, uniform in magnitude and direction [N], (num_envs, 2)."""
-    force = uniform((num_envs,), 0.0, cfg.force, generator)
-    angle = uniform((num_envs,), -math.pi, math.pi, generator)
-    return force[:, None] * torch.stack([torch.cos(angle), torch.sin(angle)], dim=1)
+def push_force(push: Tensor) -> Tensor:
+    """Return horizontal forces [N], (num_envs, 2), from magnitude and direction (num_envs, 2) [N, rad]."""
+    magnitude, direction = push.split(1, dim=1)
+    return magnitude * torch.cat([torch.cos(direction), torch.sin(direction)], dim=1)

@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from telebip.config import EpisodeConfig, PushConfig
+from telebip.config import EpisodeConfig, TaskConfig, load_task
 from telebip.math import yaw
-from telebip.mdp.randomization import initial_state, sample_pushes, uniform
+from telebip.mdp.randomization import Draws, initial_qpos, push_force, ranges, uniform
 
 HOME = torch.tensor([0.0, 0.0, 0.66, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.04, 0.0, 0.0, 0.04])
 EPISODE = EpisodeConfig(
@@ -21,11 +21,16 @@ EPISODE = EpisodeConfig(
     reset_ang_vel=0.3,
     reset_heading=math.pi,
 )
-PUSH = PushConfig(enabled=True, force=50.0, duration=0.1, interval=(1.0, 3.0))
 
 
-def draw(cfg: EpisodeConfig = EPISODE, seed: int = 0, num_envs: int = 2048) -> tuple[Tensor, Tensor]:
-    return initial_state(HOME, num_envs, cfg, torch.Generator().manual_seed(seed))
+def draws(cfg: TaskConfig, seed: int = 0, num_envs: int = 2048) -> dict[str, Tensor]:
+    return Draws(ranges(cfg), torch.device("cpu")).draw(num_envs, torch.Generator().manual_seed(seed))
+
+
+def draw(episode: EpisodeConfig = EPISODE, seed: int = 0, num_envs: int = 2048) -> tuple[Tensor, Tensor]:
+    """Initial qpos and qvel."""
+    numbers = draws(dataclasses.replace(load_task("telebip_flat"), episode=episode), seed, num_envs)
+    return initial_qpos(HOME, numbers["joint_offset"], numbers["heading"]), numbers["qvel"]
 
 
 def clearance(qpos: Tensor) -> Tensor:
@@ -98,8 +103,27 @@ def test_same_seed_same_states() -> None:
         assert not torch.equal(first, other)
 
 
+def test_every_number_fills_its_range_and_is_drawn_independently() -> None:
+    settings = ("disturbance.push.interval=[1,3]", "disturbance.friction.range=[0.5,1.1]", "command.ang_vel_z=[-0.2,0.3]")
+    cfg = load_task("telebip_flat", settings)
+    numbers = draws(cfg, num_envs=8192)
+    assert {name: part.shape for name, part in numbers.items()} == {k: (8192, len(v)) for k, v in ranges(cfg).items()}
+    fills(numbers["push_interval"], 1.0, 3.0)
+    fills(numbers["friction"], 0.5, 1.1)
+    for column, (low, high) in enumerate(((0.4, 1.0), (0.0, 0.0), (-0.2, 0.3))):
+        if low < high:
+            fills(numbers["command"][:, [column]], low, high)
+        else:
+            assert not numbers["command"][:, column].any()
+    columns = torch.cat(list(numbers.values()), dim=1).T
+    varied = columns[columns.std(1) > 0.0]
+    correlation = torch.corrcoef(varied) - torch.eye(len(varied))
+    assert len(varied) == sum(map(len, ranges(cfg).values())) - 2  # all but two velocities that are always zero
+    assert correlation.abs().max() < 0.06  # of 325 pairs, 8192 samples each: 5.4 standard deviations
+
+
 def test_pushes_are_uniform_in_magnitude_and_direction() -> None:
-    force = sample_pushes(4096, PUSH, torch.Generator().manual_seed(0))
+    force = push_force(draws(load_task("telebip_flat", ["disturbance.push.force=50"]), num_envs=4096)["push"])
     magnitude = torch.linalg.vector_norm(force, dim=1)
     fills(magnitude[:, None], 0.0, 50.0)
     assert magnitude.mean().item() == pytest.approx(25.0, abs=1.0)
@@ -107,6 +131,6 @@ def test_pushes_are_uniform_in_magnitude_and_direction() -> None:
     torch.testing.assert_close(force.mean(0), torch.zeros(2), atol=1.5, rtol=0.0)
 
 
-def test_push_of_no_force_is_no_push() -> None:
-    none = sample_pushes(8, dataclasses.replace(PUSH, force=0.0), torch.Generator().manual_seed(0))
-    torch.testing.assert_close(none, torch.zeros(8, 2))
+def test_a_push_points_where_its_direction_says() -> None:
+    force = push_force(torch.tensor([[10.0, 0.0], [10.0, math.pi / 2], [0.0, 1.0]]))
+    torch.testing.assert_close(force, torch.tensor([[10.0, 0.0], [0.0, 10.0], [0.0, 0.0]]), atol=1e-5, rtol=0.0)
