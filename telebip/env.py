@@ -13,7 +13,7 @@ from telebip.mdp.commands import hold_heading
 from telebip.mdp.context import StepContext
 from telebip.mdp.curriculum import ramp
 from telebip.mdp.observations import heading_relative_quat, noise_amplitude, observation
-from telebip.mdp.randomization import Draws, initial_qpos, push_force, ranges, uniform
+from telebip.mdp.randomization import Draws, initial_qpos, push_force, ranges
 from telebip.mdp.rewards import reward_terms
 from telebip.robot import Robot
 from telebip.sim import Backend, make_simulator
@@ -65,7 +65,7 @@ class TelebipEnv(VecEnv):
         self._home_qpos, self._nominal, self._force_limit = map(constant, (robot.home_qpos, robot.nominal, robot.force_limit))
         self._action_scale = constant([cfg.action.hip_roll, cfg.action.hip_pitch, cfg.action.knee] * 2)
         self._draws = Draws(ranges(cfg), self.device)
-        self._noise_amplitude = constant(noise_amplitude(cfg.disturbance.noise))
+        self._noise = Draws({"noise": [(-a, a) for a in noise_amplitude(cfg.disturbance.noise).tolist()]}, self.device)
         self._foot_weights = constant(gait.window_weights(window, cfg.reward.foot.gamma, cfg.reward.foot.first))
         self._friction = self.sim.model_fields["geom_friction"][:, robot.engine_floor_id, 0]  # live, one per world
 
@@ -184,7 +184,7 @@ class TelebipEnv(VecEnv):
         quat = heading_relative_quat(state.base_quat, self.reference_heading)
         obs = observation(state, self._nominal, self.last_action, self._base_lin_vel_b, quat, self.command, self.phase)
         if self.cfg.disturbance.noise.enabled:
-            obs += self._noise_amplitude * uniform((self.num_envs, obs.shape[1]), -1.0, 1.0, self.generator)
+            obs += self._noise.draw(self.num_envs, self.generator)["noise"]
         return TensorDict({"policy": obs}, batch_size=[self.num_envs], device=self.device)
 
     @property

@@ -61,11 +61,11 @@ class NativeSimulator:
         self._batch.rollout(self._decimation, record=tuple(self._record), out=self._record)
         self.state.qpos.copy_(self._qpos)
         self.state.qvel.copy_(self._qvel)
-        self.state.foot_force.copy_(self._sensors.mean(1)[:, self._foot_adr])
-        self.state.joint_force.copy_(self._force.mean(1))
+        self.state.foot_force.copy_(_mean(self._sensors)[:, self._foot_adr])
+        self.state.joint_force.copy_(_mean(self._force))
         power = self._force * self._velocity
-        self.state.joint_net_power.copy_(power.mean(1))
-        self.state.joint_power.copy_(power.abs_().mean(1))
+        self.state.joint_net_power.copy_(_mean(power))
+        self.state.joint_power.copy_(_mean(power.abs_()))
         return self.state
 
     @property
@@ -89,3 +89,9 @@ class NativeSimulator:
             target.numpy()[worlds] = value.numpy()[worlds]
         for target in (self._warmstart, self._time, *self.state.step_means):
             target.numpy()[worlds] = 0.0
+
+
+def _mean(record: Tensor) -> Tensor:
+    """Return the mean over the physics steps of a record (num_envs, steps, ...); `record.mean(1)` takes three times as long."""
+    first, *others = record.unbind(1)
+    return sum(others, first) / record.shape[1]
