@@ -74,6 +74,8 @@ def main(argv: Sequence[str] | None = None) -> None:
             show("measuring", done, total)
             stock_threads = threads if options.stock else 0
             rows.append(measure(config, robot, device, options.backend, checkpoint, options.rounds, stock_threads, progress))
+            if not console.is_terminal:
+                console.print(f"measured {config.num_envs} worlds")
 
     machine = machine_name(device)
     console.print(
