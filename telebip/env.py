@@ -322,5 +322,6 @@ class TelebipEnv(VecEnv):
             "error/yaw_rate_radps": yaw_rate_error,
             "walk/cost_of_transport": power / (self.robot.weight * speed),
             "walk/falls_per_minute": falls * (60.0 / self.step_dt),
+            "fault/worlds": fault.sum(),
             **{f"fault/{kind}": number for kind, number in zip(KINDS, faults.sum(1), strict=True)},
         }

@@ -11,10 +11,12 @@ from rsl_rl.env import VecEnv
 from torch import Tensor
 from worlds import LAST_ACTION, NEVER_FALL, PHASE, HostReads, MakeEnv, observe, put, put_low, random_actions
 
+from telebip.config import load_task
 from telebip.env import TelebipEnv
 from telebip.math import wrap_angle
 from telebip.mdp.rewards import REWARDS
 from telebip.robot import Robot
+from telebip.sim import Backend
 
 
 @pytest.mark.parametrize("num_envs", [1, 4])
@@ -326,8 +328,9 @@ def test_both_backends_show_the_same(make_env: MakeEnv) -> None:
         assert torch.equal(dones_w, dones_n)
 
 
-def test_the_same_seed_gives_the_same_numbers_and_another_does_not(make_env: MakeEnv) -> None:
-    a, b, other = make_env(num_envs=8), make_env(num_envs=8), make_env("seed=2", num_envs=8)
+@pytest.mark.parametrize("backend", ["native", "warp"])
+def test_the_same_seed_gives_the_same_numbers_and_another_does_not(make_env: MakeEnv, backend: Backend) -> None:
+    a, b, other = (make_env(f"seed={seed}", num_envs=8, backend=backend) for seed in (1, 1, 2))
     assert not torch.equal(observe(a), observe(other))
     observe(b)
     ended = 0
@@ -339,6 +342,18 @@ def test_the_same_seed_gives_the_same_numbers_and_another_does_not(make_env: Mak
         assert torch.equal(dones_a, dones_b)
         ended += int(dones_a.sum())
     assert ended > 0  # resets are part of it
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_cuda_repeats_itself_within_float32s_reach(robot: Robot) -> None:
+    """Sums in another order round differently, and contacts let that grow; within a second it stays below 1e-3."""
+    config = load_task("telebip_flat", ["num_envs=64"])
+    a, b = (TelebipEnv(config, robot, "cuda", "warp") for _ in range(2))
+    for action in random_actions(50, 64, 0.3).cuda():
+        seen, again = a.step(action), b.step(action)
+        torch.testing.assert_close(seen[0]["policy"], again[0]["policy"], atol=1e-3, rtol=0.0)
+        assert torch.equal(seen[2], again[2])
 
 
 def test_a_step_reads_nothing_back_to_the_host(make_env: MakeEnv) -> None:

@@ -11,8 +11,10 @@ from worlds import NEVER_FALL, HostReads, MakeEnv, put, random_actions
 
 from telebip import ROOT
 from telebip.config import load_task
+from telebip.control.policy import Stateless
 from telebip.env import TelebipEnv
 from telebip.errors import UserError
+from telebip.eval.rollout import roll_out
 from telebip.mdp.faults import KINDS
 from telebip.replay import load_fault, replay, save_fault
 from telebip.robot import load_robot
@@ -119,7 +121,8 @@ def test_warp_reports_constraints_that_do_not_fit(make_env: MakeEnv) -> None:
     env = make_env("sim.max_constraints=3", calm=True, backend="warp")
     seen = [counts(env.step(torch.zeros(4, 6))[3]) for _ in range(4)]  # on landing: two feet have eight rows
     assert {kind for kinds in seen for kind in kinds} == {"capacity"}
-    assert "sim.max_constraints (3)" in env.sim.advice["capacity"]
+    with pytest.raises(UserError, match=r"did not fit; raise sim\.max_contacts \(8\) or sim\.max_constraints \(3\)"):
+        roll_out(env, Stateless(lambda obs: torch.zeros(4, 6)), steps=1)
 
 
 def test_the_engine_leaves_no_log_file(make_env: MakeEnv, tmp_path: Path, monkeypatch, capfd) -> None:

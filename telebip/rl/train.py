@@ -124,7 +124,7 @@ class Trainer:
                     logs = {key: logs.get(key, 0) + value for key, value in extras["log"].items()}
                 collected = time.perf_counter()
                 counts = {key: value.item() for key, value in logs.items() if key.startswith("fault/")}
-                self._check_faults(counts)
+                self._check_faults(dict(counts))
                 learner.compute_returns(obs)
             losses = learner.update()
             self._check_weights(losses)
@@ -227,8 +227,7 @@ class Trainer:
                 dumped = f"cannot be dumped: {error.strerror or error}"
             self.note(f"fault: {kind}, {describe(record)}{f' ({said})' if said else ''}; {dumped}")
         env, cfg = self.env, self.env.cfg.ppo
-        number = sum(counts.values())
-        rate = number / (env.num_envs * cfg.num_steps_per_env)
+        rate = counts.pop("fault/worlds") / (env.num_envs * cfg.num_steps_per_env)
         full = counts["fault/capacity"] > 0.0
         if not self.ranks.any(full or rate > cfg.max_fault_rate, env.device):
             return
@@ -240,7 +239,7 @@ class Trainer:
                 f"{env.sim.advice['capacity']}, then go on with --resume {self.run_dir}"
             )
         raise UserError(
-            f"iteration {self.iteration + 1}: {rate:.2g} faults per environment step ({found}), more than "
+            f"iteration {self.iteration + 1}: {rate:.2g} faulty worlds per environment step ({found}), more than "
             f"ppo.max_fault_rate={cfg.max_fault_rate:g}; saved {self.run_dir}, see its faults folder"
         )
 
