@@ -41,6 +41,8 @@ def section(schema: type) -> Any:
 class SimConfig:
     robot: str = MISSING
     decimation: int = quantity(ge=1, le=1000)
+    max_contacts: int = quantity(ge=1, le=10_000)
+    max_constraints: int = quantity(ge=1, le=100_000)
 
 
 @dataclass
@@ -181,6 +183,8 @@ class PpoConfig:
     min_std_ramp: tuple[float, float] = quantity("samples", ge=0)
     mixed_precision: Literal["auto", "always", "never"] = MISSING
     save_interval: int = quantity(ge=1)
+    keep_checkpoints: int = quantity(ge=1)
+    max_fault_rate: float = quantity(ge=0, le=1)
 
 
 @dataclass
@@ -228,9 +232,13 @@ def load(schema: type[Schema], source: str | Schema, overrides: Sequence[str] = 
 
 
 def parse_config(text: str, source: str) -> TaskConfig:
-    """Rebuild a configuration from `to_yaml`'s text, as checkpoints and run folders hold it; `source` names it in errors."""
+    """Rebuild a configuration from `to_yaml`'s text, as checkpoints and run folders hold it; `source` names it in errors.
+
+    Fields that are younger than the text have the values of `telebip_flat`, which enters each with one that changes nothing.
+    """
     config, origins = OmegaConf.structured(TaskConfig), {}
-    _apply(config, _parse_yaml(text, source), origins)
+    for leaves in (*_layers("telebip_flat"), _parse_yaml(text, source)):
+        _apply(config, leaves, origins)
     return _validate(config, origins, source)
 
 

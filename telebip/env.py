@@ -1,5 +1,8 @@
 """The vectorised environment: the order of one step, and nothing else. Every term it calls lives in `telebip.mdp`."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
@@ -12,11 +15,21 @@ from telebip.mdp.actions import joint_targets
 from telebip.mdp.commands import hold_heading
 from telebip.mdp.context import StepContext
 from telebip.mdp.curriculum import ramp
-from telebip.mdp.observations import heading_relative_quat, noise_amplitude, observation
+from telebip.mdp.faults import KINDS, FaultRecorder
+from telebip.mdp.observations import LAYOUT, heading_relative_quat, observation
 from telebip.mdp.randomization import Draws, initial_qpos, push_force, ranges
 from telebip.mdp.rewards import reward_terms
 from telebip.robot import Robot
 from telebip.sim import Backend, make_simulator
+
+MODEL_FIELDS = ("geom_friction",)
+"""Fields of the model that differ between worlds."""
+
+MEMORY = (
+    *("episode_length_buf", "last_action", "command", "target_command", "reference_heading", "push_wrench_w"),
+    *("_push_timer", "_push_time_left", "_command_timer", "_foot_window", "_base_lin_vel_b", "_noise"),
+)
+"""Buffers of the environment that outlast a step; all else is computed anew in each."""
 
 
 class TelebipEnv(VecEnv):
@@ -50,7 +63,8 @@ class TelebipEnv(VecEnv):
         self.num_envs, self.num_actions = cfg.num_envs, 6
         self._keep_final_obs = keep_final_obs
         self._rewards = reward_terms(cfg.reward)
-        self.sim = make_simulator(backend, robot, self.num_envs, cfg.sim.decimation, self.device, ("geom_friction",))
+        capacity = cfg.sim.max_contacts, cfg.sim.max_constraints
+        self.sim = make_simulator(backend, robot, self.num_envs, cfg.sim.decimation, self.device, MODEL_FIELDS, capacity)
         self.step_dt = cfg.sim.decimation * robot.physics_dt  # [s]
         self.max_episode_length: int = max(1, round(cfg.episode.length / self.step_dt))  # policy steps
         self.generator = torch.Generator(self.device).manual_seed(cfg.seed)
@@ -65,7 +79,6 @@ class TelebipEnv(VecEnv):
         self._home_qpos, self._nominal, self._force_limit = map(constant, (robot.home_qpos, robot.nominal, robot.force_limit))
         self._action_scale = constant([cfg.action.hip_roll, cfg.action.hip_pitch, cfg.action.knee] * 2)
         self._draws = Draws(ranges(cfg), self.device)
-        self._noise = Draws({"noise": [(-a, a) for a in noise_amplitude(cfg.disturbance.noise).tolist()]}, self.device)
         self._foot_weights = constant(gait.window_weights(window, cfg.reward.foot.gamma, cfg.reward.foot.first))
         self._friction = self.sim.model_fields["geom_friction"][:, robot.engine_floor_id, 0]  # live, one per world
 
@@ -86,6 +99,10 @@ class TelebipEnv(VecEnv):
         self._energy_share = torch.ones((), device=self.device)
         self._push_share = torch.ones((), device=self.device)
         self._command_is_fixed = False
+        self._noise = zeros(sum(LAYOUT.values()))  # on the present observation
+        self.num_steps = 0  # since the worlds were made
+        self._fault_recorder = FaultRecorder(self.num_envs, self.device)
+        self._memory_before = {name: memory.clone() for name, memory in self.sim.memory.items()}
 
         self.reset()
 
@@ -96,6 +113,7 @@ class TelebipEnv(VecEnv):
         state = self.sim.state
         self._base_lin_vel_b.copy_(rotate_inverse(state.base_quat, state.base_lin_vel_w))
         self._update_commands(draws)
+        self._noise.copy_(draws["noise"])
         return self.get_observations()
 
     def set_command(self, lin_vel_x: float, lin_vel_y: float, ang_vel_z: float) -> None:
@@ -116,6 +134,8 @@ class TelebipEnv(VecEnv):
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
         """Apply `actions` (num_envs, 6) for one policy step.
 
+        A world with a fault (`mdp.faults.KINDS`) ends its episode as by a fall; nothing non-finite leaves it.
+
         Returns:
             Observations {"policy": (num_envs, 33)}, rewards (num_envs,), dones (num_envs,) bool, and extras: `time_outs`
             (num_envs,) bool, and `log`, a dictionary of scalars on the device: each reward term's mean, errors and faults.
@@ -130,8 +150,13 @@ class TelebipEnv(VecEnv):
         # 1. Physics: hold the joint targets for `decimation` steps of the engine.
         draws = self._draws.draw(self.num_envs, self.generator)
         self._update_pushes(draws)
+        given, finite = actions, actions.isfinite().all(1)
+        actions = torch.where(finite[:, None], given, 0.0)
         self.joint_target.copy_(joint_targets(actions, self._nominal, self._action_scale))
+        for name, memory in self.sim.memory.items():
+            self._memory_before[name].copy_(memory)
         state = self.sim.step(self.joint_target, self.push_wrench_w)
+        self.num_steps += 1
 
         # 2. Clocks and derived quantities at the new time.
         self.episode_length_buf += 1
@@ -141,8 +166,11 @@ class TelebipEnv(VecEnv):
         sample = gait.foot_sample(self.phase, state.foot_force, self.robot.weight, cfg.reward.foot.cap)
         self._foot_window.copy_(gait.push_sample(self._foot_window, sample))
 
-        # 3. Terminations. A world with a non-finite state ends its episode like a fall, and is counted as a fault.
-        fault = terminations.non_finite(state)
+        # 3. Terminations. A world with a fault ends its episode like a fall, and is counted by the kind of fault.
+        faults = torch.cat([torch.stack([~finite, terminations.non_finite(state)]), self.sim.faults])
+        cause = {**self._memory_before, **self.sim.model_fields, "action": given, "push_wrench_w": self.push_wrench_w}
+        self._fault_recorder.note(faults, cause, self.num_steps)
+        fault = faults.any(0)
         terminated = terminations.fallen(state, cfg.episode.min_hip_height) | fault
         time_outs = terminations.timed_out(self.episode_length_buf, self.max_episode_length) & ~terminated
         dones = terminated | time_outs
@@ -165,27 +193,60 @@ class TelebipEnv(VecEnv):
         terms = torch.where(fault & ~torch.isfinite(terms), 0.0, terms)
         self.reward_terms.copy_(terms)
         rewards = terms.sum(0)
-        log = self._log(context, terms, fault)
+        log = self._log(context, terms, faults)
         self.last_action.copy_(actions)
 
         # 5. Reset finished worlds, draw new commands where they are due, observe.
         extras = {"time_outs": time_outs, "log": log}
+        self._noise.copy_(draws["noise"])
         if self._keep_final_obs:
             self._hold_heading()
             extras["final_obs"] = self.get_observations()
         self._reset(dones, draws)
         self._base_lin_vel_b.copy_(rotate_inverse(state.base_quat, state.base_lin_vel_w))
         self._update_commands(draws)
-        return self.get_observations(), rewards, dones, extras
+        obs = self.get_observations()
+        if self._keep_final_obs:
+            extras["final_obs"]["policy"] = torch.where(fault[:, None], obs["policy"], extras["final_obs"]["policy"])
+        return obs, rewards, dones, extras
 
     def get_observations(self) -> TensorDict:
-        """Return a new {"policy": (num_envs, 33)}, with fresh noise where it is enabled; see `mdp.observations.LAYOUT`."""
+        """Return a new {"policy": (num_envs, 33)} of the present state and its noise; see `mdp.observations.LAYOUT`."""
         state = self.sim.state
         quat = heading_relative_quat(state.base_quat, self.reference_heading)
         obs = observation(state, self._nominal, self.last_action, self._base_lin_vel_b, quat, self.command, self.phase)
         if self.cfg.disturbance.noise.enabled:
-            obs += self._noise.draw(self.num_envs, self.generator)["noise"]
+            obs += self._noise
         return TensorDict({"policy": obs}, batch_size=[self.num_envs], device=self.device)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return a copy of all that the worlds' future depends on; `load_state_dict` goes on from it, bit for bit."""
+        live = {"sim": self.sim.memory, "model": self.sim.model_fields, "mdp": {name: getattr(self, name) for name in MEMORY}}
+        copies = {part: {name: value.clone() for name, value in values.items()} for part, values in live.items()}
+        return {**copies, "generator": self.generator.get_state(), "num_steps": self.num_steps}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from another environment's `state_dict`.
+
+        Raises:
+            ValueError: it has other worlds: of another number, robot, engine, or length of the gait's period.
+        """
+        live = {"sim": self.sim.memory, "model": self.sim.model_fields, "mdp": {name: getattr(self, name) for name in MEMORY}}
+        for part, values in live.items():
+            for name, value in values.items():
+                found = state[part].get(name)
+                if found is None or (found.shape, found.dtype) != (value.shape, value.dtype):
+                    raise ValueError(f"'{name}' differs")
+        self.sim.load(state["sim"])
+        for part in ("model", "mdp"):
+            for name, value in live[part].items():
+                value.copy_(state[part][name])
+        self.generator.set_state(state["generator"].cpu())
+        self.num_steps = state["num_steps"]
+
+    def take_faults(self) -> dict[str, dict[str, Any]]:
+        """Return the first faulty world of each kind that has not been taken yet; see `mdp.faults`. Waits for the device."""
+        return self._fault_recorder.take()
 
     @property
     def phase(self) -> Tensor:
@@ -234,9 +295,9 @@ class TelebipEnv(VecEnv):
         gain, limit = self.cfg.command.heading_gain, self.cfg.command.heading_limit
         self.command.copy_(hold_heading(self.target_command, heading, self.reference_heading, gain, limit))
 
-    def _log(self, context: StepContext, terms: Tensor, fault: Tensor) -> dict[str, Tensor]:
+    def _log(self, context: StepContext, terms: Tensor, faults: Tensor) -> dict[str, Tensor]:
         """Means over the worlds, as scalars on the device; faulty worlds are left out of all but their own count."""
-        state, valid = context.state, ~fault
+        state, fault = context.state, faults.any(0)
         error = context.command - torch.cat([context.base_lin_vel_b[:, :2], state.base_ang_vel_b[:, 2:]], dim=1)
         rows = torch.stack(
             [
@@ -248,12 +309,13 @@ class TelebipEnv(VecEnv):
                 context.fallen.float(),
             ]
         )
-        *rewards, lin_vel_error, yaw_rate_error, power, speed, falls = rows.masked_fill(fault, 0.0).sum(1) / valid.sum()
+        *rewards, lin_vel_error, yaw_rate_error, power, speed, falls = rows.masked_fill(fault, 0.0).sum(1) / (~fault).sum()
         return {
             **{f"reward/{name}": value for name, value in zip(self._rewards, rewards, strict=True)},
             "error/lin_vel_mps": lin_vel_error,
             "error/yaw_rate_radps": yaw_rate_error,
             "walk/cost_of_transport": power / (self.robot.weight * speed),
             "walk/falls_per_minute": falls * (60.0 / self.step_dt),
-            "fault/non_finite_worlds": fault.sum(),
+            "fault/worlds": fault.sum(),
+            **{f"fault/{kind}": number for kind, number in zip(KINDS, faults.sum(1), strict=True)},
         }

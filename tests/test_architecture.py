@@ -10,12 +10,12 @@ import pytest
 from telebip import ROOT
 
 LAYERS = [
-    {"telebip", "telebip.config", "telebip.errors", "telebip.math"},
+    {"telebip", "telebip.config", "telebip.errors", "telebip.files", "telebip.math"},
     {"telebip.robot"},
     {"telebip.sim"},
     {"telebip.mdp"},
     {"telebip.env"},
-    {"telebip.rl", "telebip.control", "telebip.eval", "telebip.viz", "telebip.gym"},
+    {"telebip.rl", "telebip.control", "telebip.eval", "telebip.viz", "telebip.gym", "telebip.replay"},
     {"telebip.cli"},
     {"scripts"},
 ]

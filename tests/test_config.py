@@ -323,10 +323,11 @@ fuzz = settings(
 )
 
 
-@fuzz
-@given(text=YAMLISH)
-def test_any_text_in_a_file_is_a_task_or_a_user_error(tmp_path_factory: pytest.TempPathFactory, text: str) -> None:
-    path = tmp_path_factory.getbasetemp() / "random.yaml"
+thorough = settings(fuzz, max_examples=5000)
+OVERRIDES = st.builds("{}={}".format, st.sampled_from(KEYS), YAMLISH) | YAMLISH
+
+
+def assert_a_text_is_a_task_or_a_user_error(text: str, path: Path) -> None:
     path.write_text(text, encoding="utf-8", errors="surrogatepass")
     try:
         config = load_task(str(path))
@@ -336,12 +337,36 @@ def test_any_text_in_a_file_is_a_task_or_a_user_error(tmp_path_factory: pytest.T
         assert isinstance(config, TaskConfig)
 
 
-@fuzz
-@given(override=st.builds("{}={}".format, st.sampled_from(KEYS), YAMLISH) | YAMLISH)
-def test_any_override_is_applied_or_a_user_error(override: str) -> None:
+def assert_an_override_is_applied_or_a_user_error(override: str) -> None:
     try:
         config = load_task(FLAT, [override])
     except UserError as error:
         assert len(str(error).splitlines()) == 1
     else:
         assert math.isfinite(config.gait.period)
+
+
+@fuzz
+@given(text=YAMLISH)
+def test_any_text_in_a_file_is_a_task_or_a_user_error(tmp_path_factory: pytest.TempPathFactory, text: str) -> None:
+    assert_a_text_is_a_task_or_a_user_error(text, tmp_path_factory.getbasetemp() / "random.yaml")
+
+
+@fuzz
+@given(override=OVERRIDES)
+def test_any_override_is_applied_or_a_user_error(override: str) -> None:
+    assert_an_override_is_applied_or_a_user_error(override)
+
+
+@pytest.mark.slow
+@thorough
+@given(text=YAMLISH)
+def test_thousands_of_texts(tmp_path_factory: pytest.TempPathFactory, text: str) -> None:
+    assert_a_text_is_a_task_or_a_user_error(text, tmp_path_factory.getbasetemp() / "random.yaml")
+
+
+@pytest.mark.slow
+@thorough
+@given(override=OVERRIDES)
+def test_thousands_of_overrides(override: str) -> None:
+    assert_an_override_is_applied_or_a_user_error(override)

@@ -8,11 +8,15 @@ import numpy as np
 import pytest
 import torch
 from rsl_rl.env import VecEnv
+from torch import Tensor
 from worlds import LAST_ACTION, NEVER_FALL, PHASE, HostReads, MakeEnv, observe, put, put_low, random_actions
 
+from telebip.config import load_task
+from telebip.env import TelebipEnv
 from telebip.math import wrap_angle
 from telebip.mdp.rewards import REWARDS
 from telebip.robot import Robot
+from telebip.sim import Backend
 
 
 @pytest.mark.parametrize("num_envs", [1, 4])
@@ -245,15 +249,25 @@ def test_switched_off_disturbances_are_exactly_absent(make_env: MakeEnv, robot: 
     assert torch.equal(friction, expected)
 
 
+def noise_of_a_step(env: TelebipEnv) -> Tensor:
+    """Step, and return what the noise adds to the observation."""
+    env.step(torch.ones(env.num_envs, 6))
+    noisy, noise = observe(env), env._noise.clone()
+    assert torch.equal(observe(env), noisy)  # reading is not drawing
+    env._noise.zero_()
+    clean = observe(env)
+    env._noise.copy_(noise)
+    return noisy - clean
+
+
 def test_noise_is_bounded_fresh_and_leaves_what_the_policy_knows(make_env: MakeEnv) -> None:
     env = make_env("disturbance.push.enabled=false", num_envs=16)
-    env.step(torch.ones(16, 6))
-    draws = torch.stack([observe(env) for _ in range(50)])
+    draws = torch.stack([noise_of_a_step(env) for _ in range(50)])
     amplitude = torch.cat(
         [torch.full((n,), a) for n, a in ((6, 0.005), (6, 0.1), (6, 0.0), (3, 0.05), (3, 0.1), (4, 0.01), (5, 0.0))]
     )
     spread = draws.amax(dim=(0)) - draws.amin(dim=0)
-    assert (spread <= 2.0 * amplitude + 1e-6).all()
+    assert (spread <= 2.0 * amplitude + 1e-5).all()
     assert (spread >= 1.5 * amplitude).all()  # of 50 uniform draws, the range is below three quarters once in 10^5
     assert torch.equal(spread[:, amplitude == 0.0], torch.zeros(16, 11))
 
@@ -290,8 +304,8 @@ def test_a_fault_is_counted_reset_and_stays_in_its_world(make_env: MakeEnv) -> N
             put(faulty, [3], qpos, faulty.sim.state.qvel.clone())
         obs, rewards, dones, extras = faulty.step(action)
         expected_obs, expected_rewards, expected_dones, expected_extras = healthy.step(action)
-        assert extras["log"]["fault/non_finite_worlds"].item() == (1 if step == 6 else 0)
-        assert expected_extras["log"]["fault/non_finite_worlds"].item() == 0
+        assert extras["log"]["fault/non_finite_state"].item() == (1 if step == 6 else 0)
+        assert expected_extras["log"]["fault/non_finite_state"].item() == 0
         if step == 6:
             assert dones[3]
             assert not extras["time_outs"][3]
@@ -314,8 +328,9 @@ def test_both_backends_show_the_same(make_env: MakeEnv) -> None:
         assert torch.equal(dones_w, dones_n)
 
 
-def test_the_same_seed_gives_the_same_numbers_and_another_does_not(make_env: MakeEnv) -> None:
-    a, b, other = make_env(num_envs=8), make_env(num_envs=8), make_env("seed=2", num_envs=8)
+@pytest.mark.parametrize("backend", ["native", "warp"])
+def test_the_same_seed_gives_the_same_numbers_and_another_does_not(make_env: MakeEnv, backend: Backend) -> None:
+    a, b, other = (make_env(f"seed={seed}", num_envs=8, backend=backend) for seed in (1, 1, 2))
     assert not torch.equal(observe(a), observe(other))
     observe(b)
     ended = 0
@@ -327,6 +342,18 @@ def test_the_same_seed_gives_the_same_numbers_and_another_does_not(make_env: Mak
         assert torch.equal(dones_a, dones_b)
         ended += int(dones_a.sum())
     assert ended > 0  # resets are part of it
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_cuda_repeats_itself_within_float32s_reach(robot: Robot) -> None:
+    """Sums in another order round differently, and contacts let that grow; within a second it stays below 1e-3."""
+    config = load_task("telebip_flat", ["num_envs=64"])
+    a, b = (TelebipEnv(config, robot, "cuda", "warp") for _ in range(2))
+    for action in random_actions(50, 64, 0.3).cuda():
+        seen, again = a.step(action), b.step(action)
+        torch.testing.assert_close(seen[0]["policy"], again[0]["policy"], atol=1e-3, rtol=0.0)
+        assert torch.equal(seen[2], again[2])
 
 
 @pytest.mark.parametrize("backend", ["native", "warp"])

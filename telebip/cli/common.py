@@ -13,6 +13,8 @@ from telebip.errors import UserError, nearest
 if TYPE_CHECKING:
     import torch
 
+    from telebip.rl.checkpoint import Checkpoint
+
 
 CONTROLLERS = ("alip", "dcm")
 """Model-based walkers, as `telebip.control.factory.PLACEMENTS` names them; here, so that `--help` needs no torch."""
@@ -66,6 +68,16 @@ def run(command: Callable[[], None]) -> NoReturn:
     except BrokenPipeError:  # the reader of our output has gone, as in `... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     sys.exit(0)
+
+
+def open_checkpoint(path: str | Path) -> "Checkpoint":
+    """Load a checkpoint as `telebip.rl.checkpoint.load_checkpoint` does, and say which newer ones are damaged."""
+    from telebip.rl.checkpoint import load_checkpoint
+
+    checkpoint = load_checkpoint(path)
+    for line in checkpoint.damaged:
+        print(f"note: {line}; using {checkpoint.path.name} instead", file=sys.stderr)
+    return checkpoint
 
 
 def resolve_device(name: str) -> "torch.device":

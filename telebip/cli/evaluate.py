@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from hashlib import sha256
 from pathlib import Path
 
-from telebip.cli.common import CONTROLLERS, Parser, resolve_device
+from telebip.cli.common import CONTROLLERS, Parser, open_checkpoint, resolve_device
 from telebip.config import load_task
 from telebip.errors import UserError
 
@@ -76,10 +76,9 @@ def controller_subject(name: str, label: str | None, overrides: Sequence[str] = 
 def subject_of(checkpoint_path: str, label: str | None, overrides: Sequence[str] = ()):
     """Return what a checkpoint holds as a subject of the evaluator; the label is the name of its task unless one is given."""
     from telebip.eval.suites import Subject
-    from telebip.rl.checkpoint import load_checkpoint
     from telebip.rl.policy import load_policy
 
-    checkpoint = load_checkpoint(checkpoint_path)
+    checkpoint = open_checkpoint(checkpoint_path)
     return Subject(
         label=label or checkpoint.task,
         config=load_task(checkpoint.config, overrides),

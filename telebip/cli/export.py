@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from telebip.cli.common import Parser
+from telebip.cli.common import Parser, open_checkpoint
 from telebip.errors import UserError
 
 EXAMPLES = """\
@@ -31,9 +31,8 @@ def main(argv: Sequence[str] | None = None) -> None:
 
     console = Console(highlight=False, soft_wrap=True)
     with console.status("loading torch"):
-        from telebip.rl.checkpoint import load_checkpoint
         from telebip.rl.export import export
-    checkpoint = load_checkpoint(options.checkpoint)
+    checkpoint = open_checkpoint(options.checkpoint)
     with console.status("exporting"):
         difference = export(checkpoint, out, SAMPLES)
     console.print(f"wrote {out}: the policy of {checkpoint.path}, after {checkpoint.iteration} iterations of {checkpoint.task}")

@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from telebip import ROOT
-from telebip.cli.common import Parser
+from telebip.cli.common import Parser, open_checkpoint
 from telebip.errors import UserError, nearest
 from telebip.viz.opengl import choose_opengl
 
@@ -54,12 +54,11 @@ class Gallery:
     def __init__(self, checkpoint: str, command: tuple[float, float, float]) -> None:
         """Walk the policy from rest."""
         from telebip.eval.conditions import as_evaluated
-        from telebip.rl.checkpoint import load_checkpoint
         from telebip.rl.policy import load_policy
         from telebip.robot import load_robot
         from telebip.viz.scene import line_up
 
-        self.checkpoint, self.command = load_checkpoint(checkpoint), command
+        self.checkpoint, self.command = open_checkpoint(checkpoint), command
         self.config = as_evaluated(self.checkpoint.config, num_envs=1, duration=SECONDS)
         self.robot = load_robot(self.config.sim.robot)
         self.rollout = self._walk(lambda env: load_policy(self.checkpoint, "cpu"))

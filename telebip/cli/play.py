@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from telebip.cli.common import CONTROLLERS, Parser, resolve_device
+from telebip.cli.common import CONTROLLERS, Parser, open_checkpoint, resolve_device
 from telebip.config import TaskConfig, load_task
 from telebip.control.config import split_overrides
 from telebip.errors import UserError
@@ -21,6 +21,7 @@ EXAMPLES = """\
   play.py --checkpoint assets/policies/telebip_efficient --num-envs 64 --duration 20
   play.py --controller alip --command 0.7 0 0 control.swing_height=0.05    (a model-based walker)
   play.py --checkpoint assets/policies/telebip_efficient --beside alip dcm --record both.mp4
+  play.py --replay runs/telebip_flat/2026-01-31_12-00-00/faults/non_finite_state.pt
   play.py --agent zero --task telebip_flat --duration 3                    (what the robot does without a policy)
 """
 
@@ -29,11 +30,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Parse arguments, walk, and print what was measured."""
     options = _parse(argv)
     choose_opengl()
+    if options.replay:
+        return _replay(options)
     checkpoint = None
     if options.checkpoint:
-        from telebip.rl.checkpoint import load_checkpoint
-
-        checkpoint = load_checkpoint(options.checkpoint)
+        checkpoint = open_checkpoint(options.checkpoint)
         task, config = checkpoint.task, checkpoint.config
     else:
         task, config = Path(options.task).stem, load_task(options.task)
@@ -82,6 +83,28 @@ def _play(options: argparse.Namespace, task: str, config: TaskConfig, command, c
         console.print(f"{who}: {task}, {summary.worlds} world{'s' if summary.worlds > 1 else ''} x {summary.duration:g} s")
         console.print(_lines(summary))
     _show(console, options, rollouts, robot)
+
+
+def _replay(options: argparse.Namespace) -> None:
+    """Repeat the step of a dumped fault, say what happens at which physics step, and show it as asked."""
+    from rich.console import Console
+
+    from telebip.replay import describe, load_fault, replay
+
+    console = Console(highlight=False, soft_wrap=True)
+    fault = load_fault(options.replay)
+    backend = fault.backend if options.backend == "auto" else options.backend
+    done = replay(fault, backend)
+    console.print(f"{options.replay}: {fault.kind}, {describe(fault.record)}, on {fault.backend}; repeated on {backend}")
+    console.print(f"  {'physics step':>12}{'hip height [m]':>16}{'max |qvel|':>12}{'max force':>12}  faults")
+    for step, (state, faults) in enumerate(zip(done.states, done.faults, strict=True)):
+        row = f"{state.base_pos[0, 2]:16.4f}{state.qvel.abs().max():12.4g}{state.joint_force.abs().max():12.4g}"
+        console.print(f"  {step if step else 'before':>12}{row}  {', '.join(sorted(faults)) or '-'}")
+    action, push = fault.record["action"].tolist(), fault.record["push_wrench_w"].tolist()
+    console.print(f"  action        {' '.join(f'{a:.4g}' for a in action)}")
+    console.print(f"  push          {' '.join(f'{p:.4g}' for p in push[:3])} N")
+    console.print("reproduced" if done.reproduces(fault.kind) else f"not reproduced on {backend}")
+    _show(console, options, [(fault.kind, done.rollout())], done.robot)
 
 
 def _show(console, options: argparse.Namespace, rollouts, robot) -> None:
@@ -179,6 +202,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     who = parser.add_mutually_exclusive_group()
     who.add_argument("--checkpoint", metavar="PATH_OR_RUN", help="a checkpoint file, or a run folder for its newest")
     who.add_argument("--controller", choices=CONTROLLERS, help="a model-based walker, see configs/control/")
+    who.add_argument("--replay", metavar="FAULT", help="repeat the step that a training dumped as runs/.../faults/<kind>.pt")
     who.add_argument("--agent", choices=AGENTS, help="no policy: nominal joint targets, or Gaussian actions")
     parser.add_argument(
         "--task", metavar="NAME", default="telebip_flat", help="of an --agent or --controller (default: telebip_flat)"
@@ -215,7 +239,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         help="override any field of the task, or control.key of a --controller",
     )
     options = parser.parse(argv)
-    if not (options.checkpoint or options.controller or options.agent):
+    if not (options.checkpoint or options.controller or options.agent or options.replay):
         raise UserError(
             "what should walk? --checkpoint PATH_OR_RUN (try assets/policies/telebip_efficient), --controller alip|dcm, "
             "or --agent zero|random"
@@ -229,6 +253,8 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         raise UserError(f"--record writes one of FILE{', FILE'.join(SUFFIXES)}, got '{options.record}'")
     if options.show < 1:
         raise UserError(f"--show must be at least 1, got {options.show}")
+    if options.replay and options.viewer == "mujoco":
+        raise UserError("a --replay is five poses; look at them with --viewer rerun or --record")
     if options.connect and options.viewer != "rerun":
         raise UserError("--connect names a rerun viewer; it goes with --viewer rerun")
     return options

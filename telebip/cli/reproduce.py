@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from telebip import ROOT
-from telebip.cli.common import Parser, resolve_device
+from telebip.cli.common import Parser, open_checkpoint, resolve_device
 from telebip.cli.evaluate import controller_subject, progress_bar, references, subject_of
 from telebip.config import load_task
 from telebip.errors import UserError, nearest
@@ -62,39 +62,20 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def _train(console, training, seed: int, options: argparse.Namespace) -> Path | None:
     """Train, or go on training, one policy; return its run folder, or None if the user stopped it."""
-    from telebip.cli.train import progress_bar as training_bar
-    from telebip.cli.train import stop_on_signal
-    from telebip.env import TelebipEnv
-    from telebip.rl.checkpoint import load_checkpoint
-    from telebip.rl.process import prepare_cpu
-    from telebip.rl.run import describe_run
-    from telebip.rl.train import Trainer
-    from telebip.robot import load_robot
+    from telebip.cli.train import train
 
     run_dir = Path(options.runs) / f"{training.name}-seed{seed}"
     config = load_task(training.task, [f"seed={seed}", *training.overrides, *(QUICK_TRAINING if options.quick else ())])
-    checkpoint = load_checkpoint(run_dir) if any(run_dir.glob("model_*.pt")) else None
+    checkpoint = open_checkpoint(run_dir) if any(run_dir.glob("model_*.pt")) else None
     if checkpoint and checkpoint.iteration >= config.ppo.max_iterations:
         console.print(f"{training.name}, seed {seed}: trained already, {checkpoint.samples / 1e6:.1f} M samples in {run_dir}")
         return run_dir
-    device = resolve_device(options.device)
-    if device.type == "cpu":
-        prepare_cpu()
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"cannot write to '{run_dir}': {error.strerror or error}") from error
-    trainer = Trainer(TelebipEnv(config, load_robot(config.sim.robot), device), training.task, run_dir)
-    if checkpoint:
-        trainer.resume(checkpoint)
-    console.print(f"{training.name}, seed {seed}: training in {run_dir}, from iteration {trainer.iteration}")
-    describe_run(run_dir, config, str(device), "auto")
-    with stop_on_signal(console) as stop, training_bar(console, trainer) as show:
-        trainer.learn(stop, show)
-    if trainer.iteration < config.ppo.max_iterations:
-        console.print("stopped; the same command goes on from here")
-        return None
-    return run_dir
+    console.print(f"{training.name}, seed {seed}: training in {run_dir}")
+    return run_dir if train(training.task, config, run_dir, checkpoint, options.device) else None
 
 
 def _measure(console, out: Path, walker, options: argparse.Namespace, subject) -> None:

@@ -5,10 +5,15 @@ import signal
 from collections.abc import Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from telebip.cli.common import Parser, invocation, resolve_device
+from telebip.cli.common import Parser, invocation, open_checkpoint, resolve_device
 from telebip.config import TaskConfig, load_task, task_names
 from telebip.errors import UserError
+
+if TYPE_CHECKING:
+    from telebip.rl.checkpoint import Checkpoint
+    from telebip.sim import Backend
 
 EXAMPLES = """\
   train.py --task telebip_flat
@@ -33,23 +38,45 @@ def main(argv: Sequence[str] | None = None) -> None:
     ] + options.overrides
 
     if options.resume:
-        from telebip.rl.checkpoint import load_checkpoint
-
-        checkpoint = load_checkpoint(options.resume)
+        checkpoint = open_checkpoint(options.resume)
         if options.task and options.task != checkpoint.task:
             raise UserError(f"checkpoint '{checkpoint.path}' is of task '{checkpoint.task}', not of '{options.task}'")
         if "optimizer_state_dict" not in checkpoint.learner:
             raise UserError(f"checkpoint '{checkpoint.path}' holds the policy alone; resume from a model_<iteration>.pt")
-        task, config, run_dir = checkpoint.task, load_task(checkpoint.config, overrides), checkpoint.path.parent
+        task, config = checkpoint.task, load_task(checkpoint.config, overrides)
+        run_dir: str | Path = checkpoint.path.parent
     elif options.task:
-        checkpoint, run_dir = None, None
-        task, config = Path(options.task).stem, load_task(options.task, overrides)
+        checkpoint, task, config, run_dir = None, Path(options.task).stem, load_task(options.task, overrides), options.log_dir
     else:
         raise UserError(f"which task? --task {{{','.join(task_names())}}}, or --resume a run")
-    _train(options, task, config, run_dir, checkpoint)
+    train(task, config, run_dir, checkpoint, options.device, options.backend, options.viewer == "rerun", options.connect)
 
 
-def _train(options: argparse.Namespace, task: str, config: TaskConfig, run_dir: Path | None, checkpoint) -> None:
+def train(
+    task: str,
+    config: TaskConfig,
+    folder: str | Path,
+    checkpoint: "Checkpoint | None" = None,
+    device_name: str = "auto",
+    backend: "Backend" = "auto",
+    watched: bool = False,
+    connect: str | None = None,
+) -> bool:
+    """Train with progress and logs until the end or Ctrl-C.
+
+    Args:
+        task: its name.
+        config: what to train.
+        folder: the run's own, as a `Path`; or, as a text, where to make one.
+        checkpoint: where to go on from.
+        device_name: as `resolve_device` takes it.
+        backend: physics engine.
+        watched: whether to show the training in the rerun viewer.
+        connect: address of a running viewer.
+
+    Returns:
+        Whether all iterations are done.
+    """
     from rich.console import Console
 
     from telebip.rl.distributed import Ranks, joined
@@ -59,44 +86,49 @@ def _train(options: argparse.Namespace, task: str, config: TaskConfig, run_dir: 
     with console.status("loading torch and the physics engine"):
         from telebip.env import TelebipEnv
         from telebip.rl.process import prepare_cpu
-        from telebip.rl.run import create_run_dir, describe_run
+        from telebip.rl.run import create_run_dir, describe_run, exclusive, require_space
         from telebip.rl.train import Trainer
         from telebip.robot import load_robot
 
-    if options.viewer == "rerun" and ranks.is_main:
+    if watched and ranks.is_main:
         from telebip.viz.rerun import require_viewer
 
-        require_viewer(options.connect)
-    device = resolve_device(ranks.device_name(options.device))
+        require_viewer(connect)
+    device = resolve_device(ranks.device_name(device_name))
     if device.type == "cpu":
         prepare_cpu()
     with joined(ranks, device), ExitStack() as stack:
         robot = load_robot(config.sim.robot)
         with console.status("creating the worlds (the warp backend compiles for a minute or two the first time)"):
-            env = TelebipEnv(load_task(config, [f"seed={config.seed + ranks.rank}"]), robot, device, options.backend)
-            run_dir = run_dir or (create_run_dir(Path(options.log_dir), task) if ranks.is_main else Path())
-            trainer = Trainer(env, task, run_dir, ranks)
-        if checkpoint:
-            trainer.resume(checkpoint)
+            env = TelebipEnv(load_task(config, [f"seed={config.seed + ranks.rank}"]), robot, device, backend)
+            run_dir = Path()
+            if ranks.is_main:
+                run_dir = folder if isinstance(folder, Path) else create_run_dir(Path(folder), task)
+                stack.enter_context(exclusive(run_dir))
+            trainer = Trainer(env, task, run_dir, ranks, note=lambda line: console.print(f"note: {line}"))
+        restart = trainer.resume(checkpoint) if checkpoint else ""
         total = config.ppo.max_iterations
         if trainer.iteration >= total:
             console.print(f"{run_dir} has finished its {total} iterations; raise --max-iterations to train on")
-            return
+            return True
         backend = type(env.sim).__name__.removesuffix("Simulator").lower()
         if ranks.is_main:
+            require_space(run_dir, trainer.checkpoint_bytes(), config.ppo.keep_checkpoints)
             describe_run(run_dir, config, str(device), backend, ranks.size)
         arithmetic = "bfloat16" if trainer.learner.use_mixed_precision else "float32"
         worlds = f"{config.num_envs} worlds" if ranks.size == 1 else f"{ranks.size} processes x {config.num_envs} worlds"
         console.print(f"{task}: {worlds} on {device} ({backend}), update in {arithmetic}, writing to {run_dir}")
         if trainer.iteration:
             console.print(f"resuming after iteration {trainer.iteration} of {total}")
+        if restart:
+            console.print(f"note: the worlds start new episodes, as {restart}")
 
         stop = stack.enter_context(stop_on_signal(console))
         show = watch = stack.enter_context(progress_bar(console, trainer))
-        if options.viewer == "rerun" and ranks.is_main:
+        if watched and ranks.is_main:
             from telebip.viz.live import live_view
 
-            live = stack.enter_context(live_view(trainer, options.connect))
+            live = stack.enter_context(live_view(trainer, connect))
 
             def watch(scalars: dict[str, float]) -> None:
                 show(scalars)
@@ -109,6 +141,7 @@ def _train(options: argparse.Namespace, task: str, config: TaskConfig, run_dir: 
             f"stopped after iteration {trainer.iteration} of {total}; go on with: {invocation('train')} --resume {run_dir}"
         )
     console.print(f"see it walk: {invocation('play')} --checkpoint {run_dir}")
+    return finished
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from telebip.control.policy import Policy
 from telebip.env import TelebipEnv
+from telebip.eval.rollout import require_capacity
 from telebip.mdp.randomization import uniform
 
 DIRECTIONS = {"forward": (1.0, 0.0), "backward": (-1.0, 0.0), "left": (0.0, 1.0), "right": (0.0, -1.0)}
@@ -94,6 +95,9 @@ def push_trial(
         policy: what walks.
         protocol: when and how hard.
         progress: called with the number of finished policy steps.
+
+    Raises:
+        UserError: the engine had no room for a world's contacts or constraints.
     """
     shape = (len(protocol.forces), len(DIRECTIONS), protocol.worlds)
     force = torch.as_tensor(protocol.forces, dtype=torch.float32, device=env.device)[:, None, None, None]
@@ -114,4 +118,5 @@ def push_trial(
             walked = max(0.0, (step + 1) * env.step_dt - protocol.warmup)
             survival = torch.where(dones & survival.isinf(), walked, survival)
             progress(step + 1)
+    require_capacity(env)
     return survival.reshape(shape).cpu().numpy()

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from telebip.control.policy import Policy
 from telebip.env import TelebipEnv
+from telebip.errors import UserError
 from telebip.sim import SimState
 
 
@@ -64,6 +65,9 @@ def roll_out(env: TelebipEnv, policy: Policy, steps: int, progress: Callable[[in
         policy: what walks; its memory of all worlds is cleared first.
         steps: number of policy steps.
         progress: called with the number of finished steps.
+
+    Raises:
+        UserError: the engine had no room for a world's contacts or constraints.
     """
     rows: list[dict[str, Tensor]] = []
     with torch.inference_mode():
@@ -84,5 +88,12 @@ def roll_out(env: TelebipEnv, policy: Policy, steps: int, progress: Callable[[in
             rows.append({name: value.clone() for name, value in row.items()})
             rows[-1] |= {"command": command, "reward": reward, "fallen": dones & ~extras["time_outs"]}
             progress(step + 1)
+    require_capacity(env)
     arrays = {name: torch.stack([row[name] for row in rows]).cpu().numpy() for name in rows[0]}
     return Rollout(step_dt=env.step_dt, weight=env.robot.weight, reward_names=env.reward_names, **arrays)
+
+
+def require_capacity(env: TelebipEnv) -> None:
+    """Raise a `UserError` if the engine had no room for a world's contacts or constraints: what it then did is no physics."""
+    if "capacity" in env.take_faults():
+        raise UserError(f"contacts or constraints did not fit; {env.sim.advice['capacity']}")

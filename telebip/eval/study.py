@@ -26,19 +26,19 @@ class Baseline:
     suites: tuple[str, ...] = ("tracking", "push", "gait")
 
 
-SHORT = "ppo.max_iterations=100"
-"""8.2 M samples, what the article needs to converge."""
+SHORT = ("num_envs=2048", "ppo.num_steps_per_env=24", "ppo.symmetry=phase", "ppo.max_iterations=100")
+"""4.9 M samples, enough for a policy that learns half of the gait from many small batches."""
 
 ALL = ("tracking", "push", "gait", "learning")
 
 TRAININGS = (
     Training("telebip_efficient", "RL, efficient", "telebip_efficient", suites=ALL),
     Training("telebip_flat", "RL, article's rewards", "telebip_flat", suites=ALL),
-    Training("no_foot_reward", "RL, no foot reward", "telebip_flat", ("reward.foot.k_foot=0", SHORT)),
-    Training("period_06", "RL, period 0.6 s", "telebip_flat", ("gait.period=0.6", SHORT)),
-    Training("telebip_slow", "RL, slow", "telebip_slow", (SHORT,)),
-    Training("telebip_fast", "RL, fast", "telebip_fast", (SHORT,)),
-    Training("telebip_backward", "RL, backward", "telebip_backward", (SHORT,)),
+    Training("no_foot_reward", "RL, no foot reward", "telebip_flat", ("reward.foot.k_foot=0", "ppo.max_iterations=100")),
+    Training("period_06", "RL, period 0.6 s", "telebip_flat", ("gait.period=0.6", *SHORT)),
+    Training("telebip_slow", "RL, slow", "telebip_slow", SHORT),
+    Training("telebip_fast", "RL, fast", "telebip_fast", SHORT),
+    Training("telebip_backward", "RL, backward", "telebip_backward", SHORT),
 )
 
 BASELINES = (

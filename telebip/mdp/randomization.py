@@ -1,4 +1,4 @@
-"""Random draws: initial states, pushes, ground friction, commands. All from one seeded generator per environment."""
+"""Random draws: initial states, pushes, ground friction, commands, noise. All from one seeded generator per environment."""
 
 import math
 
@@ -7,6 +7,7 @@ from torch import Tensor
 
 from telebip.config import TaskConfig
 from telebip.math import quat_from_yaw
+from telebip.mdp.observations import noise_amplitude
 
 KNEES = slice(2, None, 3)
 
@@ -32,6 +33,7 @@ def ranges(cfg: TaskConfig) -> Ranges:
         "friction": [cfg.disturbance.friction.range],
         "push_interval": [push.interval],  # [s]
         "push": [(0.0, push.force), (-math.pi, math.pi)],  # magnitude [N], direction [rad]
+        "noise": [(-float(amplitude), float(amplitude)) for amplitude in noise_amplitude(cfg.disturbance.noise)],
         "command": [command.lin_vel_x, command.lin_vel_y, command.ang_vel_z],  # [m/s, m/s, rad/s]
     }
 

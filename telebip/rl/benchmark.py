@@ -17,8 +17,9 @@ import copy
 import gc
 import platform
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -33,7 +34,7 @@ from telebip.errors import UserError
 from telebip.rl.checkpoint import Checkpoint
 from telebip.rl.train import Trainer
 from telebip.robot import Robot
-from telebip.sim import Backend
+from telebip.sim import Backend, Simulator
 
 WARM_UP = 2.0
 """How long the robots walk before anything is measured [s]."""
@@ -76,8 +77,8 @@ class Ladder:
             UserError: the policy does not fit the task.
         """
         before = allocated_bytes(device)
-        self.env = TelebipEnv(cfg, robot, device, backend)
-        self._trainer = Trainer(self.env, "", Path())
+        self.env = env = TelebipEnv(cfg, robot, device, backend)
+        self._trainer = Trainer(env, "", Path())
         actor = self._trainer.learner.actor
         try:
             actor.load_state_dict(checkpoint.learner["actor_state_dict"])
@@ -85,18 +86,16 @@ class Ladder:
             raise UserError(f"checkpoint '{checkpoint.path}' holds no weights that fit the task's policy") from error
         self._weights = copy.deepcopy(self._trainer.learner.save())
         self._trainer.learner.train_mode()
-        env = self.env
-        env.episode_length_buf = torch.randint(env.max_episode_length, (env.num_envs,), generator=env.generator, device=device)
-        with torch.inference_mode():
-            obs = self._trainer.view.get_observations()
-            for _ in range(round(WARM_UP / env.step_dt)):
-                obs = self._trainer.view.step(actor(obs))[0]
         self._iteration(self._trainer)  # allocates what an iteration needs
         self.bytes_per_env = (allocated_bytes(device) - before) / cfg.num_envs
         self._stock_threads = stock_threads
         self._stock = StockTrainer(env, "", Path()) if stock_threads else None
         if self._stock:
             self._stock.learner.train_mode()
+        with torch.inference_mode():
+            obs = self._trainer.view.get_observations()
+            for _ in range(round(WARM_UP / env.step_dt)):
+                obs = self._trainer.view.step(actor(obs))[0]
 
     @property
     def batch(self) -> int:
@@ -111,29 +110,28 @@ class Ladder:
     def round(self) -> Seconds:
         """Measure every rung once, and walk on."""
         env, learner = self.env, self._trainer.learner
-        start = snapshot(env)
+        start = env.state_dict()
         seed = torch.seed()
-        with recorded(env) as (actions, states), torch.inference_mode():
+        with recorded(env) as (actions, calls), torch.inference_mode():
             self._trainer.collect(self._trainer.view.get_observations())
         learner.storage.clear()
 
         seconds = {"engine": 0.0}
-        for state in states:
-            write_back(env.sim.buffers, state)
+        for call in calls:
+            call.prepare(env.sim)
             seconds["engine"] += self._timed(env.sim.advance)
-        states.clear()
-        restore(env, start)
+        calls.clear()
+        env.load_state_dict(start)
         with torch.inference_mode():
-            env.get_observations()  # as before: the draws go on from there
             seconds["env"] = self._timed(lambda: [env.step(action)[2] for action in actions])
         if self._stock:
-            restore(env, start)
+            env.load_state_dict(start)
             torch.manual_seed(seed)
             threads = torch.get_num_threads()
             torch.set_num_threads(self._stock_threads)
             seconds |= {f"stock_{rung}": value for rung, value in self._iteration(self._stock).items()}
             torch.set_num_threads(threads)
-        restore(env, start)
+        env.load_state_dict(start)
         torch.manual_seed(seed)
         return seconds | self._iteration(self._trainer)
 
@@ -229,11 +227,28 @@ def summary(rounds: list[Seconds], batch: int) -> dict[str, float]:
     return row
 
 
+@dataclass(frozen=True)
+class EngineCall:
+    """Where the worlds were when the engine was called, and with what; copies."""
+
+    memory: dict[str, Tensor]
+    model_fields: dict[str, Tensor]
+    targets: Tensor
+    wrench_w: Tensor
+
+    def prepare(self, sim: Simulator) -> None:
+        """Put `sim` into the same state, so that `sim.advance` does the same again."""
+        sim.load(self.memory)
+        for name, value in self.model_fields.items():
+            sim.model_fields[name].copy_(value)
+        sim.write(self.targets, self.wrench_w)
+
+
 @contextmanager
-def recorded(env: TelebipEnv) -> Iterator[tuple[list[Tensor], list[list[Tensor]]]]:
-    """Note down the actions of each `env.step`, and the simulator's buffers, inputs included, at its call of the engine."""
+def recorded(env: TelebipEnv) -> Iterator[tuple[list[Tensor], list[EngineCall]]]:
+    """Note down the actions of each `env.step`, and its call of the engine."""
     actions: list[Tensor] = []
-    states: list[list[Tensor]] = []
+    calls: list[EngineCall] = []
     step, advance = env.step, env.sim.step
 
     def env_step(action: Tensor):
@@ -241,13 +256,13 @@ def recorded(env: TelebipEnv) -> Iterator[tuple[list[Tensor], list[list[Tensor]]
         return step(action)
 
     def sim_step(targets: Tensor, wrench_w: Tensor):
-        env.sim.write(targets, wrench_w)
-        states.append([buffer.clone() for buffer in env.sim.buffers])
+        memory, fields = ({name: x.clone() for name, x in part.items()} for part in (env.sim.memory, env.sim.model_fields))
+        calls.append(EngineCall(memory, fields, targets.clone(), wrench_w.clone()))
         return advance(targets, wrench_w)
 
     env.step, env.sim.step = env_step, sim_step
     try:
-        yield actions, states
+        yield actions, calls
     finally:
         del env.step, env.sim.step
 
@@ -277,25 +292,3 @@ def machine_name(device: torch.device) -> str:
         if names:
             return names[0]
     return platform.processor() or platform.machine()
-
-
-def snapshot(env: TelebipEnv) -> tuple[list[Tensor], Tensor]:
-    """Return copies of all that decides how an environment goes on: buffers and the generator's state."""
-    return [buffer.clone() for buffer in _buffers(env)], env.generator.get_state()
-
-
-def restore(env: TelebipEnv, taken: tuple[list[Tensor], Tensor]) -> None:
-    """Bring an environment back to where it was."""
-    buffers, generator = taken
-    write_back(_buffers(env), buffers)
-    env.generator.set_state(generator)
-
-
-def write_back(buffers: Sequence[Tensor], values: Sequence[Tensor]) -> None:
-    """Copy values into live buffers."""
-    for buffer, value in zip(buffers, values, strict=True):
-        buffer.copy_(value)
-
-
-def _buffers(env: TelebipEnv) -> tuple[Tensor, ...]:
-    return *(value for value in vars(env).values() if isinstance(value, Tensor)), *env.sim.buffers

@@ -1,11 +1,13 @@
 """Checkpoints: self-contained, written atomically, and data only (`weights_only=True`): loading one never runs code.
 
+A checkpoint is a zip archive, as `torch.save` writes it; the CRC-32 of each of its records tells whether it is as written.
 A policy exported to ONNX is read as a checkpoint too: one that can be walked, but not resumed.
 """
 
-import os
+import io
 import re
-from dataclasses import dataclass
+import zipfile
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +16,10 @@ import torch
 from telebip import ROOT
 from telebip.config import TaskConfig, parse_config, to_yaml
 from telebip.errors import UserError
+from telebip.files import write_atomically
 from telebip.mdp.observations import LAYOUT
 from telebip.rl.onnx import OnnxPolicy
-from telebip.robot import JOINTS
+from telebip.robot import JOINTS, Robot
 
 FORMAT = "telebip-checkpoint-1"
 POLICIES = ROOT / "assets" / "policies"
@@ -32,6 +35,9 @@ class Checkpoint:
     iteration: int  # finished iterations
     samples: int  # environment steps seen in training
     learner: dict[str, Any]  # state dictionaries as `rsl_rl.algorithms.PPO.save` returns them; none in an ONNX file
+    training: list[dict[str, Any]] = field(default_factory=list)  # of each process: its worlds, generators and statistics
+    robot: dict[str, list[float]] = field(default_factory=dict)  # what `robot_properties` said of the robot trained on
+    damaged: tuple[str, ...] = ()  # newer checkpoints of the same folder that could not be read: why, a line each
 
     @property
     def is_onnx(self) -> bool:
@@ -39,8 +45,25 @@ class Checkpoint:
         return self.path.suffix == ".onnx"
 
 
-def save_checkpoint(path: Path, task: str, config: TaskConfig, iteration: int, samples: int, learner: dict[str, Any]) -> None:
-    """Write a checkpoint to `path`: complete, or not at all."""
+class DamagedCheckpointError(UserError):
+    """A checkpoint's bytes are not those that were written: an older one of the same run will do."""
+
+
+def save_checkpoint(
+    path: Path,
+    task: str,
+    config: TaskConfig,
+    iteration: int,
+    samples: int,
+    learner: dict[str, Any],
+    training: list[dict[str, Any]] | None = None,
+    robot: dict[str, list[float]] | None = None,
+) -> None:
+    """Write a checkpoint to `path`: complete, or not at all. See `Checkpoint` for what it holds.
+
+    Raises:
+        OSError: it cannot be written.
+    """
     content = {
         "format": FORMAT,
         "task": task,
@@ -49,15 +72,23 @@ def save_checkpoint(path: Path, task: str, config: TaskConfig, iteration: int, s
         "action": list(JOINTS),
         "iteration": iteration,
         "samples": samples,
+        "robot": robot or {},
         **learner,
+        **({"training": training} if training else {}),
     }
-    partial = path.with_suffix(".partial")
-    torch.save(content, partial)
-    os.replace(partial, path)
+    archive = io.BytesIO()
+    torch.save(content, archive)
+    write_atomically(path, archive.getvalue())
+
+
+def prune_checkpoints(run_dir: Path, keep: int) -> None:
+    """Delete all but the `keep` newest of a run folder's `model_<iteration>.pt`."""
+    for file in _numbered(run_dir)[keep:]:
+        file.unlink(missing_ok=True)
 
 
 def load_checkpoint(path: str | Path) -> Checkpoint:
-    """Load a checkpoint file (.pt or .onnx), or the newest one of a run folder.
+    """Load a checkpoint file (.pt or .onnx), or the newest one of a run folder that is not damaged.
 
     Args:
         path: from the working directory, from telebip's own folder, or the name of a policy that comes with telebip.
@@ -65,15 +96,23 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     Raises:
         UserError: there is none, it is damaged or unsafe, or its observations or actions are laid out differently.
     """
-    file = _find(Path(path))
-    if file.suffix == ".onnx":
-        return _load_onnx(file)
+    damaged: list[str] = []
+    candidates = _find(Path(path))
+    for file in candidates:
+        try:
+            return replace(_load_onnx(file) if file.suffix == ".onnx" else _load_file(file), damaged=tuple(damaged))
+        except DamagedCheckpointError as error:
+            if len(candidates) == 1:
+                raise
+            damaged.append(str(error))
+    raise UserError(f"folder '{path}' holds {len(candidates)} checkpoints, all damaged: {damaged[0]}")
+
+
+def _load_file(file: Path) -> Checkpoint:
     try:
-        content = torch.load(file, map_location="cpu", weights_only=True)
+        content = _read(file)
     except OSError as error:
         raise UserError(f"checkpoint '{file}' cannot be read: {error.strerror or error}") from error
-    except Exception as error:  # bytes that are no checkpoint fail in as many ways as there are bytes
-        raise UserError(f"checkpoint '{file}' is not a telebip checkpoint: it is damaged, or holds more than data") from error
     if not isinstance(content, dict) or "format" not in content:
         raise UserError(f"checkpoint '{file}' is not a telebip checkpoint")
     if content["format"] != FORMAT:
@@ -84,7 +123,26 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     _check_layout(file, content["observation"], content["action"])
     learner = {key: value for key, value in content.items() if key.endswith("_state_dict")}
     config = parse_config(content["config"], f"{file}:config")
-    return Checkpoint(file, content["task"], config, content["iteration"], content["samples"], learner)
+    training, robot = content.get("training", []), content.get("robot", {})
+    return Checkpoint(file, content["task"], config, content["iteration"], content["samples"], learner, training, robot)
+
+
+def _read(file: Path) -> Any:
+    """Return what the archive holds, if every record's checksum is right and all of it is data."""
+    archive = io.BytesIO(file.read_bytes())
+    try:
+        with zipfile.ZipFile(archive) as records:
+            if records.testzip() is not None:
+                raise DamagedCheckpointError(f"checkpoint '{file}' is damaged: a checksum is wrong")
+    except UserError:
+        raise
+    except Exception as error:  # bytes that are no archive fail in as many ways as there are bytes
+        raise DamagedCheckpointError(f"checkpoint '{file}' is not a telebip checkpoint, or is damaged") from error
+    archive.seek(0)
+    try:
+        return torch.load(archive, map_location="cpu", weights_only=True)
+    except Exception as error:
+        raise UserError(f"checkpoint '{file}' is not a telebip checkpoint: it holds more than data") from error
 
 
 def _load_onnx(file: Path) -> Checkpoint:
@@ -100,16 +158,32 @@ def _check_layout(file: Path, observation: dict[str, int], action: list[str]) ->
             raise UserError(f"checkpoint '{file}': its {part} layout {found} differs from this version's {expected}")
 
 
-def _find(given: Path) -> Path:
+def robot_properties(robot: Robot) -> dict[str, list[float]]:
+    """Return what tells robots apart: weight [N], nominal pose [rad | m], force limits [N m | N], physics step [s]."""
+    return {
+        "weight": [robot.weight],
+        "nominal pose": robot.nominal.tolist(),
+        "force limits": robot.force_limit.tolist(),
+        "physics step": [robot.physics_dt],
+    }
+
+
+def _find(given: Path) -> list[Path]:
+    """Return the files that a path stands for, the best one first."""
     path = next((p for p in (given, ROOT / given, POLICIES / given) if p.exists()), given)
     if path.is_file():
-        return path
+        return [path]
     if not path.exists():
         shipped = ", ".join(sorted(folder.name for folder in POLICIES.glob("*")))
         raise UserError(f"checkpoint '{path}' does not exist; policies that come with telebip: {shipped}")
-    numbered = {int(m[1]): file for file in path.glob("model_*.pt") if (m := re.fullmatch(r"model_(\d+)\.pt", file.name))}
-    if numbered:
-        return numbered[max(numbered)]
+    if numbered := _numbered(path):
+        return numbered
     if (path / "policy.pt").is_file():
-        return path / "policy.pt"
+        return [path / "policy.pt"]
     raise UserError(f"folder '{path}' holds no checkpoint (model_<iteration>.pt or policy.pt)")
+
+
+def _numbered(run_dir: Path) -> list[Path]:
+    """Return a run folder's `model_<iteration>.pt`, the newest first."""
+    files = {int(m[1]): file for file in run_dir.glob("model_*.pt") if (m := re.fullmatch(r"model_(\d+)\.pt", file.name))}
+    return [files[iteration] for iteration in sorted(files, reverse=True)]

@@ -1,9 +1,11 @@
 """`learning.csv`: one row of numbers per iteration, beside TensorBoard's files, for people, spreadsheets and reports."""
 
 import csv
-import os
+import io
 from collections.abc import Mapping
 from pathlib import Path
+
+from telebip.files import write_atomically
 
 FILE = "learning.csv"
 
@@ -15,14 +17,12 @@ class CurveWriter:
         """Open the file of `run_dir`, keeping its rows up to `samples` environment steps."""
         self._path = run_dir / FILE
         rows = read_curve(run_dir) if self._path.exists() else []
-        partial = self._path.with_suffix(".partial")
-        with partial.open("w", newline="", encoding="utf-8") as file:
-            kept = [row for row in rows if row["samples"] <= samples]
-            if kept:
-                writer = csv.DictWriter(file, list(kept[0]))
-                writer.writeheader()
-                writer.writerows({name: f"{value:.6g}" for name, value in row.items()} for row in kept)
-        os.replace(partial, self._path)
+        kept, text = [row for row in rows if row["samples"] <= samples], io.StringIO(newline="")
+        if kept:
+            writer = csv.DictWriter(text, list(kept[0]))
+            writer.writeheader()
+            writer.writerows({name: f"{value:.6g}" for name, value in row.items()} for row in kept)
+        write_atomically(self._path, text.getvalue().encode())
 
     def add(self, row: Mapping[str, float]) -> None:
         """Append one iteration's numbers; the first row names the columns."""
@@ -34,11 +34,12 @@ class CurveWriter:
 
 
 def read_curve(run_dir: Path) -> list[dict[str, float]]:
-    """Return the rows of a run's `learning.csv`.
+    """Return the rows of a run's `learning.csv`; a last one that was not finished is left out.
 
     Raises:
         OSError: there is no such file.
         ValueError: it holds something other than numbers.
     """
     with (run_dir / FILE).open(newline="", encoding="utf-8") as file:
-        return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
+        finished = [line for line in file if line.endswith("\n")]
+    return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(finished)]

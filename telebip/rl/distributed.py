@@ -11,7 +11,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from telebip.errors import UserError
 
@@ -69,6 +69,16 @@ class Ranks:
         flags = torch.tensor(float(flag), device=device)
         torch.distributed.all_reduce(flags, op=torch.distributed.ReduceOp.MAX)
         return bool(flags > 0.0)
+
+    def gather(self, state: dict[str, Any]) -> list[dict[str, Any]]:
+        """Return every process's `state` to the first one, and an empty list to the others; all of them have to call."""
+        if self.size == 1:
+            return [state]
+        import torch.distributed
+
+        states: list[Any] | None = [None] * self.size if self.is_main else None
+        torch.distributed.gather_object(state, states)
+        return states or []
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 """Settings of the whole process that make training on a CPU fast. A thread count may change how sums round, nothing else."""
 
 import ctypes
+import functools
 import sys
 
 import torch
@@ -9,8 +10,9 @@ import torch
 M_TRIM_THRESHOLD, M_MMAP_MAX, M_ARENA_MAX = -1, -4, -8
 
 
+@functools.cache  # halving the threads is for once
 def prepare_cpu() -> None:
-    """Keep freed memory, and share the processors between actor and critic; call once, before the first worker thread starts.
+    """Keep freed memory, and share the processors between actor and critic; call it before the first worker thread starts.
 
     glibc hands blocks of more than 32 MB back to the kernel when they are freed, and smaller ones when enough of them lie at
     the heap's end. The update allocates and frees its activations 16 times per iteration, and took as long to have the kernel

@@ -2,22 +2,28 @@
 
 import json
 import platform
+import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock, Timeout
+
 from telebip import ROOT, __version__
 from telebip.config import TaskConfig, to_yaml
 from telebip.errors import UserError
+from telebip.files import write_atomically
 
 PACKAGES = ("mujoco", "mujoco-warp", "warp-lang", "torch", "rsl-rl-lib", "numpy")
 
 
 def create_run_dir(log_dir: Path, task: str) -> Path:
-    """Create `log_dir/<task>/<date>_<time>`, a folder that no other run has.
+    """Create `log_dir/<task>/<date>_<time>`, a folder that no other run has, with a free name of the same second if need be.
 
     Raises:
         UserError: the folder cannot be made.
@@ -37,7 +43,6 @@ def create_run_dir(log_dir: Path, task: str) -> Path:
 
 def describe_run(run_dir: Path, config: TaskConfig, device: str, backend: str, processes: int = 1) -> None:
     """Write `config.yaml`, complete, and append this start's versions, git revision and command line to `run.json`."""
-    (run_dir / "config.yaml").write_text(to_yaml(config), encoding="utf-8")
     start = {
         "time": datetime.now().astimezone().isoformat(timespec="seconds"),
         "command": sys.argv,
@@ -47,8 +52,46 @@ def describe_run(run_dir: Path, config: TaskConfig, device: str, backend: str, p
         **describe_code(),
     }
     file = run_dir / "run.json"
-    starts = json.loads(file.read_text(encoding="utf-8"))["starts"] if file.exists() else []
-    file.write_text(json.dumps({"starts": [*starts, start]}, indent=2) + "\n", encoding="utf-8")
+    try:
+        starts = json.loads(file.read_text(encoding="utf-8"))["starts"] if file.exists() else []
+        write_atomically(file, (json.dumps({"starts": [*starts, start]}, indent=2) + "\n").encode())
+        write_atomically(run_dir / "config.yaml", to_yaml(config).encode())
+    except (OSError, ValueError, KeyError) as error:
+        raise UserError(f"cannot write to run folder '{run_dir}': {error}") from error
+
+
+@contextmanager
+def exclusive(run_dir: Path) -> Iterator[None]:
+    """Keep other processes from training in `run_dir` for the duration of the context, however this process ends.
+
+    Raises:
+        UserError: another process is at it, or the folder cannot be written to.
+    """
+    lock = FileLock(run_dir / ".lock")
+    try:
+        lock.acquire(timeout=0)
+    except Timeout as error:
+        raise UserError(f"another process is training in '{run_dir}'; stop it first") from error
+    except OSError as error:
+        raise UserError(f"cannot write to run folder '{run_dir}': {error.strerror or error}") from error
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def require_space(run_dir: Path, checkpoint_bytes: int, checkpoints: int) -> None:
+    """Say so before the training starts if the disk has no room for its checkpoints.
+
+    Raises:
+        UserError: it has not.
+    """
+    free, needed = shutil.disk_usage(run_dir).free, checkpoint_bytes * (checkpoints + 1)
+    if free < needed:
+        raise UserError(
+            f"the disk of '{run_dir}' has {free / 2**20:.0f} MiB left, and {checkpoints} checkpoints need "
+            f"{needed / 2**20:.0f} MiB; make room, or choose another --log-dir or a smaller ppo.keep_checkpoints"
+        )
 
 
 def describe_code() -> dict[str, Any]:

@@ -6,23 +6,26 @@ checkpoints as pickles; this loop uses its algorithm, networks and storage and d
 
 import contextlib
 import io
+import math
+import sys
+import tempfile
 import time
-from collections import deque
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
-from torch.utils.tensorboard import SummaryWriter
 
 from telebip.config import PpoConfig
 from telebip.env import TelebipEnv
 from telebip.errors import UserError
 from telebip.mdp.curriculum import ramp
-from telebip.rl.checkpoint import Checkpoint, save_checkpoint
-from telebip.rl.curve import CurveWriter
+from telebip.replay import describe, save_fault
+from telebip.rl.checkpoint import Checkpoint, prune_checkpoints, robot_properties, save_checkpoint
 from telebip.rl.distributed import Ranks
+from telebip.rl.log import EpisodeStatistics, RunLog
 from telebip.rl.policy import OBS_GROUPS, actor_cfg, critic_cfg
 from telebip.rl.ppo import FastPPO
 from telebip.rl.symmetry import SymmetricEnv
@@ -31,10 +34,21 @@ from telebip.rl.symmetry import SymmetricEnv
 class Trainer:
     """Trains one policy in one run folder."""
 
-    def __init__(self, env: TelebipEnv, task: str, run_dir: Path, ranks: Ranks | None = None) -> None:
-        """Build the learner for `env`, the same in every process of `ranks`; nothing is written before `learn`."""
-        self.env, self.task, self.run_dir, self.ranks = env, task, run_dir, ranks or Ranks()
+    def __init__(
+        self,
+        env: TelebipEnv,
+        task: str,
+        run_dir: Path,
+        ranks: Ranks | None = None,
+        note: Callable[[str], None] = lambda line: print(line, file=sys.stderr),
+    ) -> None:
+        """Build the learner for `env`, the same in every process of `ranks`; nothing is written before `learn`.
+
+        `note` is told, in a line each, what a user should know though the training goes on.
+        """
+        self.env, self.task, self.run_dir, self.ranks, self.note = env, task, run_dir, ranks or Ranks(), note
         self.iteration = self.samples = 0
+        self._saved = -1  # the iteration of the last checkpoint
         ppo = env.cfg.ppo
         if ppo.num_mini_batches > env.num_envs * ppo.num_steps_per_env:
             raise UserError(
@@ -48,9 +62,26 @@ class Trainer:
             self.learner.broadcast_parameters()
         self.view = SymmetricEnv(env) if ppo.symmetry == "phase" else env
         self._episodes = EpisodeStatistics(env.num_envs, env.device)
+        # Spread the time-outs over the iterations.
+        ages = torch.randint(env.max_episode_length, (env.num_envs,), generator=env.generator, device=env.device)
+        env.episode_length_buf.copy_(ages)
 
-    def resume(self, checkpoint: Checkpoint) -> None:
-        """Continue from a checkpoint of the same task."""
+    def resume(self, checkpoint: Checkpoint) -> str:
+        """Go on from a checkpoint of the same task and robot, bit for bit as if nothing had happened in between.
+
+        Returns:
+            Why the worlds start new episodes instead; empty if they do not. They do where the checkpoint has none, or others.
+
+        Raises:
+            UserError: the networks or the robot are not the checkpoint's.
+        """
+        own = robot_properties(self.env.robot)
+        for name, value in checkpoint.robot.items():
+            if own[name] != value:
+                raise UserError(
+                    f"checkpoint '{checkpoint.path}' was trained on another robot than '{self.env.cfg.sim.robot}': its {name} "
+                    f"is {value}, not {own[name]}"
+                )
         try:
             self.learner.load(checkpoint.learner, load_cfg=None, strict=True)
         except (RuntimeError, KeyError, ValueError) as error:
@@ -58,6 +89,13 @@ class Trainer:
                 f"checkpoint '{checkpoint.path}' cannot be resumed: {' '.join(str(error).split())[:120]}"
             ) from error
         self.iteration, self.samples = checkpoint.iteration, checkpoint.samples
+        if len(checkpoint.training) != self.ranks.size:
+            return f"the checkpoint has worlds of {len(checkpoint.training)} processes, this run has {self.ranks.size}"
+        try:
+            self._load_training(checkpoint.training[self.ranks.rank])
+        except ValueError as error:
+            return f"the checkpoint's worlds are others: {error}"
+        return ""
 
     def learn(self, stop: Callable[[], bool], report: Callable[[dict[str, float]], None]) -> None:
         """Train up to the configured total of iterations, or until `stop()` holds, and save a checkpoint at the end.
@@ -65,12 +103,13 @@ class Trainer:
         Args:
             stop: asked after every iteration; one process that says so stops them all.
             report: called after every iteration with what TensorBoard gets.
+
+        Raises:
+            UserError: too many worlds are faulty, the engine's capacity is too small, the update has ruined the policy, or
+                the last checkpoint cannot be written anywhere.
         """
         env, learner, cfg = self.env, self.learner, self.env.cfg.ppo
-        log = RunLog(self.run_dir, self.samples) if self.ranks.is_main else None
-        # Spread the time-outs over the iterations.
-        ages = torch.randint(env.max_episode_length, (env.num_envs,), generator=env.generator, device=env.device)
-        env.episode_length_buf = ages
+        log = RunLog(self.run_dir, self.samples, self.note) if self.ranks.is_main else None
         learner.train_mode()
         obs = self.view.get_observations()
         while self.iteration < cfg.max_iterations and not self.ranks.any(stop(), env.device):
@@ -80,14 +119,16 @@ class Trainer:
             with torch.inference_mode():
                 obs, logs = self.collect(obs)
                 collected = time.perf_counter()
+                counts = {key: value.item() for key, value in logs.items() if key.startswith("fault/")}
+                self._check_faults(dict(counts))
                 learner.compute_returns(obs)
             losses = learner.update()
+            self._check_weights(losses)
             learned = time.perf_counter()
 
             self.iteration += 1
             batch = env.num_envs * cfg.num_steps_per_env * self.ranks.size
             self.samples += batch
-            counts = {key: value.item() for key, value in logs.items() if key.startswith("fault/")}
             means = {key: value.item() / cfg.num_steps_per_env for key, value in logs.items() if key not in counts}
             episode_return, episode_length = self._episodes.recent()
             scalars = {
@@ -107,7 +148,7 @@ class Trainer:
             if self.iteration % cfg.save_interval == 0:
                 self.save()
             report(scalars)
-        self.save()
+        self._save_finally()
         if log:
             log.close()
 
@@ -121,14 +162,102 @@ class Trainer:
             logs = {key: logs.get(key, 0) + value for key, value in extras["log"].items()}
         return obs, logs
 
-    def save(self) -> None:
-        """Write `model_<iteration>.pt`, to go on from, and `policy.pt`, the actor alone; the first process does."""
+    def save(self) -> bool:
+        """Write `model_<iteration>.pt`, to go on from, and `policy.pt`, the actor alone; the first process does.
+
+        Returns:
+            Whether that worked. Where the disk is full, say, `note` tells, and what was there before stays.
+        """
+        training = self.ranks.gather(self._training_state())
         if not self.ranks.is_main:
+            return True
+        try:
+            self._write(self.run_dir, training)
+        except OSError as error:
+            self.note(f"cannot save to '{self.run_dir}': {error.strerror or error}; training goes on and will try again")
+            return False
+        self._saved = self.iteration
+        prune_checkpoints(self.run_dir, self.env.cfg.ppo.keep_checkpoints)
+        return True
+
+    def checkpoint_bytes(self) -> int:
+        """Return about how large a checkpoint is: the networks, twice as much for Adam, and the worlds."""
+        parameters = sum(p.numel() * p.element_size() for group in self.learner.optimizer.param_groups for p in group["params"])
+        env = self.env.state_dict()
+        worlds = sum(value.numel() * value.element_size() for part in ("sim", "model", "mdp") for value in env[part].values())
+        return 3 * parameters + worlds * self.ranks.size
+
+    def _save_finally(self) -> None:
+        """Save what must not be lost: to the run's folder or, where that fails, to the system's folder for temporary files."""
+        if self._saved == self.iteration or self.save():
             return
+        spare = Path(tempfile.mkdtemp(prefix=f"telebip_{self.run_dir.name}_"))
+        try:
+            self._write(spare, [self._training_state()])
+        except OSError as error:
+            raise UserError(f"cannot save to '{self.run_dir}' nor to '{spare}': {error.strerror or error}") from error
+        raise UserError(f"could not save to '{self.run_dir}'; the checkpoint is in '{spare}': move it there to go on")
+
+    def _write(self, folder: Path, training: list[dict[str, Any]]) -> None:
         state = self.learner.save()
         actor = {"actor_state_dict": state["actor_state_dict"]}
-        for name, part in ((f"model_{self.iteration}.pt", state), ("policy.pt", actor)):
-            save_checkpoint(self.run_dir / name, self.task, self.env.cfg, self.iteration, self.samples, part)
+        about = (self.task, self.env.cfg, self.iteration, self.samples)
+        robot = robot_properties(self.env.robot)
+        save_checkpoint(folder / f"model_{self.iteration}.pt", *about, state, training, robot)
+        save_checkpoint(folder / "policy.pt", *about, actor, robot=robot)
+
+    def _training_state(self) -> dict[str, Any]:
+        """Return what this process needs, besides the learner's state, to go on bit for bit."""
+        state = {"env": self.env.state_dict(), "episodes": self._episodes.state_dict(), "generator": torch.get_rng_state()}
+        if self.env.device.type == "cuda":
+            state["cuda_generator"] = torch.cuda.get_rng_state(self.env.device)
+        return state
+
+    def _load_training(self, state: dict[str, Any]) -> None:
+        self.env.load_state_dict(state["env"])
+        self._episodes.load_state_dict(state["episodes"])
+        torch.set_rng_state(state["generator"])
+        if self.env.device.type == "cuda" and "cuda_generator" in state:
+            torch.cuda.set_rng_state(state["cuda_generator"], self.env.device)
+
+    def _check_faults(self, counts: dict[str, float]) -> None:
+        """Dump the first fault of each kind; stop, with a checkpoint, where there are too many or the engine is too small.
+
+        Called before the update, so that the checkpoint has the policy that met the faults.
+        """
+        for kind, record in self.env.take_faults().items():
+            said = self.env.sim.advice.get(kind, "")
+            try:
+                dumped = f"dumped to {save_fault(self.run_dir, kind, record, self.task, self.env)}, for play --replay"
+            except OSError as error:
+                dumped = f"cannot be dumped: {error.strerror or error}"
+            self.note(f"fault: {kind}, {describe(record)}{f' ({said})' if said else ''}; {dumped}")
+        env, cfg = self.env, self.env.cfg.ppo
+        rate = counts.pop("fault/worlds") / (env.num_envs * cfg.num_steps_per_env)
+        full = counts["fault/capacity"] > 0.0
+        if not self.ranks.any(full or rate > cfg.max_fault_rate, env.device):
+            return
+        self._save_finally()
+        found = ", ".join(f"{int(count)} {key.removeprefix('fault/')}" for key, count in counts.items() if count)
+        if full:
+            raise UserError(
+                f"iteration {self.iteration + 1}: contacts or constraints did not fit, {int(counts['fault/capacity'])} times; "
+                f"{env.sim.advice['capacity']}, then go on with --resume {self.run_dir}"
+            )
+        raise UserError(
+            f"iteration {self.iteration + 1}: {rate:.2g} faulty worlds per environment step ({found}), more than "
+            f"ppo.max_fault_rate={cfg.max_fault_rate:g}; saved {self.run_dir}, see its faults folder"
+        )
+
+    def _check_weights(self, losses: dict[str, float]) -> None:
+        """Stop where the update has made the networks non-finite: the last checkpoint is from before it."""
+        parameters = [p for network in (self.learner.actor, self.learner.critic) for p in network.parameters()]
+        finite = torch.stack([p.isfinite().all() for p in parameters]).all()
+        if not finite or not all(math.isfinite(loss) for loss in losses.values()):
+            raise UserError(
+                f"the update of iteration {self.iteration + 1} made the networks non-finite (losses {losses}); go on from the "
+                f"last checkpoint with a lower ppo.learning_rate: --resume {self.run_dir}"
+            )
 
     def _rsl_rl_cfg(self) -> dict:
         env, ppo = self.env, self.env.cfg.ppo
@@ -148,55 +277,6 @@ class Trainer:
             "actor": {"class_name": "MLPModel", **actor_cfg(ppo)},
             "critic": {"class_name": "MLPModel", **critic_cfg(ppo)},
         }
-
-
-class RunLog:
-    """A run folder's numbers: TensorBoard's files and `learning.csv`."""
-
-    def __init__(self, run_dir: Path, samples: int) -> None:
-        """Open them at `samples` environment steps; what lies beyond is dropped."""
-        self._writer = SummaryWriter(str(run_dir), purge_step=samples + 1)
-        self._curve = CurveWriter(run_dir, samples)
-
-    def add(self, iteration: int, samples: int, scalars: dict[str, float]) -> None:
-        """Append one iteration's scalars."""
-        for key, value in scalars.items():
-            self._writer.add_scalar(key, value, samples)
-        self._curve.add({"iteration": iteration, "samples": samples, **scalars})
-
-    def close(self) -> None:
-        """Write what TensorBoard's writer still holds."""
-        self._writer.close()
-
-
-class EpisodeStatistics:
-    """Mean return and length of the episodes that ended lately, kept on the device until asked."""
-
-    def __init__(self, num_envs: int, device: torch.device, min_episodes: int = 100) -> None:
-        """Average over as many of the latest iterations as it takes to see `min_episodes` end."""
-        self._return, self._length = torch.zeros(num_envs, device=device), torch.zeros(num_envs, device=device)
-        self._sums = torch.zeros(3, device=device)  # of finished episodes: returns, lengths, number
-        self._history: deque[tuple[float, float, float]] = deque()
-        self._min_episodes = min_episodes
-
-    def add(self, rewards: Tensor, dones: Tensor) -> None:
-        """Account for one environment step: rewards (num_envs,) and dones (num_envs,) bool."""
-        self._return += rewards
-        self._length += 1.0
-        done = dones.float()
-        self._sums += torch.stack([self._return @ done, self._length @ done, done.sum()])
-        self._return.masked_fill_(dones, 0.0)
-        self._length.masked_fill_(dones, 0.0)
-
-    def recent(self) -> tuple[float, float]:
-        """Return (mean return, mean length in policy steps), NaN before any episode has ended; call once per iteration."""
-        returns, lengths, number = self._sums.tolist()
-        self._history.append((returns, lengths, number))
-        self._sums.zero_()
-        while sum(n for *_, n in self._history) - self._history[0][2] >= self._min_episodes:
-            self._history.popleft()
-        total = [sum(column) for column in zip(*self._history, strict=True)]
-        return (total[0] / total[2], total[1] / total[2]) if total[2] else (float("nan"), float("nan"))
 
 
 def min_std(cfg: PpoConfig, samples: int) -> float:

@@ -21,8 +21,9 @@ def make_simulator(
     decimation: int,
     device: torch.device,
     model_fields: Sequence[str] = (),
+    capacity: tuple[int, int] = (8, 64),
 ) -> Simulator:
-    """Create the backend: `auto` is `warp` on CUDA and `native` on the CPU.
+    """Create the backend: `auto` is `warp` on CUDA and `native` on the CPU. `capacity` is `warp`'s, see there.
 
     Raises:
         UserError: `native` was asked for on a CUDA device.
@@ -37,4 +38,4 @@ def make_simulator(
         return NativeSimulator(robot, num_envs, decimation, model_fields)
     from telebip.sim.warp import WarpSimulator
 
-    return WarpSimulator(robot, num_envs, decimation, device, model_fields)
+    return WarpSimulator(robot, num_envs, decimation, device, model_fields, *capacity)

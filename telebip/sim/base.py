@@ -1,10 +1,14 @@
 """The boundary between the MDP and the physics engines."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
 import torch
 from torch import Tensor
+
+ENGINE_FAULTS = ("engine_warning", "engine_error", "capacity")
+"""What an engine reports of a world itself: a warning, an error, or more contacts or constraints than there is room for."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +77,12 @@ class Simulator(Protocol):
     state: SimState
     model_fields: dict[str, Tensor]
     """Live per-world copies of the model fields named at construction, (num_envs, ...); writes act from the next step."""
+    faults: Tensor
+    """Which of `ENGINE_FAULTS` befell which world in the last `step`: bool, (3, num_envs)."""
+    advice: dict[str, str]
+    """What the engine says about a kind of `faults`: which setting to change, or its message."""
+    memory: dict[str, Tensor]
+    """Live tensors, in the engine's own precision, of all else that the outcome of a `step` depends on."""
 
     def step(self, targets: Tensor, wrench_w: Tensor) -> SimState:
         """Hold joint `targets` (num_envs, 6) [rad | m] and the trunk wrench for one policy step, and return `state`.
@@ -81,11 +91,6 @@ class Simulator(Protocol):
             targets: setpoints of the six position actuators.
             wrench_w: force and torque on the trunk's centre of mass, world frame [N, N m], (num_envs, 6).
         """
-        ...
-
-    @property
-    def buffers(self) -> tuple[Tensor, ...]:
-        """Everything that decides the next step, live: copies written back bring the worlds back to where they were."""
         ...
 
     def write(self, targets: Tensor, wrench_w: Tensor) -> None:
@@ -104,4 +109,8 @@ class Simulator(Protocol):
 
         A reset world has no memory: its next step is the same, bit for bit, as that of a new simulator in that state.
         """
+        ...
+
+    def load(self, memory: Mapping[str, Tensor]) -> None:
+        """Go on from a copy of `memory`, bit for bit; `state` has its positions and velocities, and means of zero."""
         ...

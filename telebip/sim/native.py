@@ -1,16 +1,21 @@
 # pyright: reportAttributeAccessIssue=false
 """C MuJoCo on a thread pool: the engine of machines without a GPU, bit-identical to a loop of `mj_step`."""
 
+import contextlib
 import copy
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import mujoco
+import numpy as np
 import torch
-from mujoco.batch import Batch
+from mujoco.batch import Batch, SimulationError
 from torch import Tensor
 
 from telebip.robot import Robot
-from telebip.sim.base import SimState
+from telebip.sim.base import ENGINE_FAULTS, SimState
+
+CAPACITY = [mujoco.mjtWarning.mjWARN_CONTACTFULL.value, mujoco.mjtWarning.mjWARN_CNSTRFULL.value]
+"""Warnings of an arena that is too small: the MJCF's `<size memory="..."/>`."""
 
 
 class NativeSimulator:
@@ -42,15 +47,17 @@ class NativeSimulator:
         # A non-finite state stays, to be seen and counted by the environment; the engine would silently reset it.
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self._batch = Batch(model, num_envs, num_threads)
-        self._rows = torch.from_numpy(self._batch.state)
-        self._qpos, self._qvel, self._warmstart, self._ctrl, self._time = (
-            torch.from_numpy(self._batch.bind(name)) for name in ("qpos", "qvel", "qacc_warmstart", "ctrl", "time")
-        )
+        self.memory = {name: torch.from_numpy(self._batch.bind(name)) for name in ("qpos", "qvel", "qacc_warmstart", "time")}
+        self._qpos, self._qvel, self._warmstart, self._time = self.memory.values()
+        self._ctrl = torch.from_numpy(self._batch.bind("ctrl"))
+        self.advice = {"capacity": 'raise <size memory="..."/> in the MJCF'}
+        self._faults = np.zeros((len(ENGINE_FAULTS), num_envs), dtype=bool)
+        self.faults = torch.from_numpy(self._faults)
         self._trunk_wrench = torch.from_numpy(self._batch.bind("xfrc_applied"))[:, robot.trunk_id]
         self.model_fields = {name: torch.from_numpy(self._batch.expand(name)) for name in model_fields}
         # Every physics step's values, (num_envs, decimation, ...), written by the engine's threads.
-        self._record = self._batch.rollout(1, record=("actuator_force", "actuator_velocity", "sensordata"))
-        self._record = {k: v.repeat(decimation, axis=1) for k, v in self._record.items()}
+        sizes = {"actuator_force": model.nu, "actuator_velocity": model.nu, "sensordata": model.nsensordata}
+        self._record = {name: np.zeros((num_envs, decimation, size)) for name, size in sizes.items()}
         self._force, self._velocity, self._sensors = (torch.from_numpy(v) for v in self._record.values())
         home = torch.from_numpy(robot.home_qpos).float().expand(num_envs, -1)
         self.reset(torch.ones(num_envs, dtype=torch.bool), home, torch.zeros(num_envs, 12))
@@ -58,7 +65,9 @@ class NativeSimulator:
     def step(self, targets: Tensor, wrench_w: Tensor) -> SimState:
         """See `Simulator.step`."""
         self.write(targets, wrench_w)
-        self._batch.rollout(self._decimation, record=tuple(self._record), out=self._record)
+        with _silence(), contextlib.suppress(SimulationError):  # those worlds keep the state that they had
+            self._batch.rollout(self._decimation, record=tuple(self._record), out=self._record)
+        self._read_faults()
         self.state.qpos.copy_(self._qpos)
         self.state.qvel.copy_(self._qvel)
         self.state.foot_force.copy_(_mean(self._sensors)[:, self._foot_adr])
@@ -67,11 +76,6 @@ class NativeSimulator:
         self.state.joint_net_power.copy_(_mean(power))
         self.state.joint_power.copy_(_mean(power.abs_()))
         return self.state
-
-    @property
-    def buffers(self) -> tuple[Tensor, ...]:
-        """See `Simulator.buffers`."""
-        return self._rows, self.state.qpos, self.state.qvel, *self.state.step_means, *self.model_fields.values()
 
     def write(self, targets: Tensor, wrench_w: Tensor) -> None:
         """See `Simulator.write`."""
@@ -89,6 +93,37 @@ class NativeSimulator:
             target.numpy()[worlds] = value.numpy()[worlds]
         for target in (self._warmstart, self._time, *self.state.step_means):
             target.numpy()[worlds] = 0.0
+
+    def _read_faults(self) -> None:
+        """Bring `faults` up to date. A world with a warning has skipped the rest of its physics steps."""
+        warnings, failed = self._batch.warning[:, :, 1], self._batch.status != 0  # numbers of warnings, (num_envs, kinds)
+        if warnings.any() or failed.any() or self._faults.any():
+            full = warnings[:, CAPACITY].any(1)
+            self._faults[:] = warnings.any(1) & ~full, failed, full
+            if failed.any():
+                self.advice["engine_error"] = self._batch.error(int(failed.argmax()))
+            self._batch.warning[:] = 0
+
+    def load(self, memory: Mapping[str, Tensor]) -> None:
+        """See `Simulator.load`."""
+        for name, live in self.memory.items():
+            live.copy_(memory[name])
+        self.state.qpos.copy_(self._qpos)
+        self.state.qvel.copy_(self._qvel)
+        for mean in self.state.step_means:
+            mean.zero_()
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Keep the engine from writing each warning to the console and to a file in the working directory; `faults` has them."""
+    before, quiet = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
+    quiet.logto_console = quiet.logto_file = False
+    quiet.set()
+    try:
+        yield
+    finally:
+        before.set()
 
 
 def _mean(record: Tensor) -> Tensor:

@@ -4,7 +4,7 @@
 The only file that imports `mujoco_warp`. Torch tensors and Warp arrays share memory in both directions.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import mujoco_warp as mjw
 import torch
@@ -12,10 +12,10 @@ import warp as wp
 from torch import Tensor
 
 from telebip.robot import Robot
-from telebip.sim.base import SimState
+from telebip.sim.base import ENGINE_FAULTS, SimState
 
-MAX_CONTACTS, MAX_CONSTRAINTS = 8, 64
-"""Per world: two feet, the feet against each other and a fallen trunk make 7 contacts of at most 6 rows; joint limits add 6."""
+CAPACITY = int(mjw.OverflowType.ALL & ~(mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS))
+"""Overflows that truncate the physics; the MJCF's limits on solver iterations are meant."""
 
 
 @wp.kernel
@@ -53,6 +53,8 @@ class WarpSimulator:
         decimation: int,
         device: torch.device,
         model_fields: Sequence[str] = (),
+        max_contacts: int = 8,
+        max_constraints: int = 64,
     ) -> None:
         """Create the worlds in the home pose; the first use on a machine compiles kernels for a minute or more.
 
@@ -62,6 +64,8 @@ class WarpSimulator:
             decimation: physics steps per `step`.
             device: where to simulate.
             model_fields: names of model fields that get one value per world.
+            max_contacts: room for contacts, per world.
+            max_constraints: room for rows of the constraint solver, per world.
         """
         self.num_envs = num_envs
         self.device = device
@@ -72,9 +76,8 @@ class WarpSimulator:
         self._wp_device = wp.device_from_torch(device)
         with wp.ScopedDevice(self._wp_device):
             self._model = mjw.put_model(robot.engine_model, batch_sizes=dict.fromkeys(model_fields, num_envs))
-            # The MJCF's limits on solver iterations are meant; exceeded capacities still print.
-            self._model.opt.warn_overflow &= ~(mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS)
-            self._data = mjw.make_data(robot.engine_model, nworld=num_envs, nconmax=MAX_CONTACTS, njmax=MAX_CONSTRAINTS)
+            self._model.opt.warn_overflow = 0  # `faults` has them
+            self._data = mjw.make_data(robot.engine_model, nworld=num_envs, nconmax=max_contacts, njmax=max_constraints)
         self.model_fields = {name: wp.to_torch(getattr(self._model, name)) for name in model_fields}
         for name, field in self.model_fields.items():
             field.copy_(
@@ -95,7 +98,13 @@ class WarpSimulator:
         self._ctrl, self._warmstart, self._time = (
             wp.to_torch(a) for a in (self._data.ctrl, self._data.qacc_warmstart, self._data.time)
         )
+        self.memory = {"qpos": state.qpos, "qvel": state.qvel, "qacc_warmstart": self._warmstart, "time": self._time}
         self._trunk_wrench = wp.to_torch(self._data.xfrc_applied)[:, robot.trunk_id]
+        self.advice = {
+            "capacity": f"raise sim.max_contacts ({max_contacts}) or sim.max_constraints ({max_constraints}), both per world"
+        }
+        self._overflow = wp.to_torch(self._data.overflow)
+        self.faults = torch.zeros(len(ENGINE_FAULTS), num_envs, dtype=torch.bool, device=device)  # warns of nothing else
         self._graphs = {True: self._capture(with_means=True)} if self._wp_device.is_cuda else {}
         home = torch.as_tensor(robot.home_qpos, dtype=torch.float32, device=device).expand(num_envs, -1)
         self.reset(torch.ones(num_envs, dtype=torch.bool, device=device), home, torch.zeros(num_envs, 12, device=device))
@@ -104,13 +113,10 @@ class WarpSimulator:
         """See `Simulator.step`."""
         self.write(targets, wrench_w)
         self._run(with_means=True)
+        torch.bitwise_and(self._overflow, CAPACITY, out=self._overflow)
+        torch.ne(self._overflow, 0, out=self.faults[ENGINE_FAULTS.index("capacity")])
+        self._overflow.zero_()
         return self.state
-
-    @property
-    def buffers(self) -> tuple[Tensor, ...]:
-        """See `Simulator.buffers`."""
-        inputs = (self._ctrl, self._trunk_wrench, self._warmstart, self._time)
-        return self.state.qpos, self.state.qvel, *inputs, *self.state.step_means, *self.model_fields.values()
 
     def write(self, targets: Tensor, wrench_w: Tensor) -> None:
         """See `Simulator.write`."""
@@ -120,6 +126,7 @@ class WarpSimulator:
     def advance(self) -> None:
         """See `Simulator.advance`; on CUDA the first call records a graph, and leaves the worlds some steps further on."""
         self._run(with_means=False)
+        self._overflow.zero_()
 
     def reset(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
         """See `Simulator.reset`."""
@@ -128,6 +135,13 @@ class WarpSimulator:
         self.state.qvel.copy_(torch.where(rows, qvel, self.state.qvel))
         for target in (self._warmstart, self._time, *self.state.step_means):
             target.masked_fill_(rows if target.dim() == 2 else mask, 0.0)
+
+    def load(self, memory: Mapping[str, Tensor]) -> None:
+        """See `Simulator.load`."""
+        for name, live in self.memory.items():
+            live.copy_(memory[name])
+        for mean in self.state.step_means:
+            mean.zero_()
 
     def _run(self, with_means: bool) -> None:
         """Run the physics steps of one policy step: on CUDA as a graph, recorded at its first use."""

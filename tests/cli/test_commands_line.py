@@ -11,6 +11,10 @@ import pytest
 import torch
 
 from telebip import ROOT
+from telebip.config import load_task
+from telebip.env import TelebipEnv
+from telebip.replay import save_fault
+from telebip.robot import load_robot
 
 TRAIN, PLAY, GALLERY = "scripts/train.py", "scripts/play.py", "scripts/gallery.py"
 TINY = ("--num-envs", "8", "--device", "cpu", "ppo.num_steps_per_env=5", "ppo.hidden_dims=[16,16]")
@@ -178,3 +182,15 @@ def test_an_interrupted_run_ends_well_and_leaves_a_checkpoint(tmp_path: Path) ->
     assert iteration >= 1
     assert (folder / f"model_{iteration}.pt").is_file()
     assert not (folder / f"model_{iteration + 1}.pt").exists()
+
+
+def test_a_dumped_fault_is_repeated_and_recorded(tmp_path: Path) -> None:
+    env = TelebipEnv(load_task("telebip_flat", ["num_envs=4"]), load_robot("assets/telebip.xml"), "cpu", "native")
+    env.sim.model_fields["geom_friction"][2] = float("inf")
+    env.step(torch.zeros(4, 6))
+    (fault,) = {save_fault(tmp_path, kind, record, "t", env) for kind, record in env.take_faults().items() if "state" in kind}
+    printed = ran(PLAY, "--replay", str(fault), "--record", str(tmp_path / "fault.rrd"))
+    assert "non_finite_state, world 2, environment step 1, on native; repeated on native" in printed
+    assert printed.splitlines()[-2] == "reproduced"
+    assert (tmp_path / "fault.rrd").stat().st_size > 0
+    assert "is not a fault" in refusal(PLAY, "--replay", "assets/policies/telebip_flat/policy.pt")

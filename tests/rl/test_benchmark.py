@@ -6,28 +6,28 @@ import pytest
 import torch
 from worlds import MakeEnv, put_low, random_actions
 
-from telebip.rl.benchmark import allocated_bytes, recorded, restore, snapshot, summary, write_back
+from telebip.rl.benchmark import allocated_bytes, recorded, summary
 
 
 def test_a_recorded_walk_can_be_gone_over_again(make_env: MakeEnv) -> None:
     env = make_env("disturbance.push.interval=[0.02,0.06]", num_envs=8)
     put_low(env, [2])  # it falls at the first step, and starts anew
-    start = snapshot(env)
-    with recorded(env) as (actions, states):
+    start = env.state_dict()
+    with recorded(env) as (actions, calls):
         walked = [env.step(action)[0]["policy"] for action in random_actions(6, 8, 0.3)]
-    assert (len(actions), len(states)) == (6, 6)
+    assert (len(actions), len(calls)) == (6, 6)
     assert "step" not in vars(env) and "step" not in vars(env.sim)
 
-    restore(env, start)
+    env.load_state_dict(start)
     again = [env.step(action)[0]["policy"] for action in actions]
     assert all(torch.equal(a, b) for a, b in zip(walked, again, strict=True))
 
-    others = [0, 1, 3, 4, 5, 6, 7]  # worlds that are not reset go from each recorded state to the next
-    qpos = slice(1, 14)  # in a row of MuJoCo's integration state, after the time
-    for state, following in pairwise(states):
-        write_back(env.sim.buffers, state)
+    others = [0, 1, 3, 4, 5, 6, 7]  # worlds that are not reset go from each call of the engine to the next
+    for call, following in pairwise(calls):
+        call.prepare(env.sim)
         env.sim.advance()
-        assert torch.equal(env.sim.buffers[0][others, qpos], following[0][others, qpos])
+        for name, value in env.sim.memory.items():
+            assert torch.equal(value[others], following.memory[name][others]), name
 
 
 def test_the_summary_is_made_of_medians_over_the_rounds() -> None:

@@ -84,6 +84,28 @@ def test_random_bytes_are_refused(tmp_path: Path) -> None:
         refusal(path)
 
 
+def test_a_single_flipped_bit_is_noticed_or_harmless(tmp_path: Path, config: TaskConfig) -> None:
+    path = write(tmp_path / "whole.pt", config)
+    content, whole = path.read_bytes(), load_checkpoint(path)
+    random, refused = np.random.default_rng(1), 0
+    for i in range(200):
+        damaged = bytearray(content)
+        damaged[int(random.integers(len(content)))] ^= 1 << int(random.integers(8))
+        path = tmp_path / f"flipped_{i}.pt"
+        path.write_bytes(bytes(damaged))
+        try:
+            loaded = load_checkpoint(path)
+        except UserError as error:
+            assert str(path) in str(error)
+            refused += 1
+        else:  # it was between the records
+            assert loaded.config == whole.config
+            assert (loaded.iteration, loaded.samples) == (7, 700)
+            for name, weight in learner()["actor_state_dict"].items():
+                assert torch.equal(loaded.learner["actor_state_dict"][name], weight)
+    assert refused > 50
+
+
 def test_scribbled_files_are_refused_or_still_whole(tmp_path: Path, config: TaskConfig) -> None:
     content = write(tmp_path / "whole.pt", config).read_bytes()
     random = np.random.default_rng(0)

@@ -12,8 +12,9 @@ from telebip.env import TelebipEnv
 from telebip.errors import UserError
 from telebip.mdp.rewards import REWARDS
 from telebip.rl.checkpoint import load_checkpoint
+from telebip.rl.log import EpisodeStatistics
 from telebip.rl.policy import load_policy
-from telebip.rl.train import EpisodeStatistics, Trainer, min_std
+from telebip.rl.train import Trainer, min_std
 from telebip.robot import Robot
 
 SMALL = ("num_envs=8", "ppo.num_steps_per_env=10", "ppo.hidden_dims=[16,16]", "episode.length=0.2")
@@ -45,13 +46,13 @@ def test_a_run_leaves_checkpoints_and_curves_and_goes_on(robot: Robot, tmp_path:
     assert set(curves) >= {
         *(f"reward/{name}" for name in REWARDS),
         *("error/lin_vel_mps", "error/yaw_rate_radps", "walk/cost_of_transport", "walk/falls_per_minute"),
-        *("fault/non_finite_worlds", "train/episode_return", "train/episode_length", "train/action_std"),
+        *("fault/non_finite_state", "train/episode_return", "train/episode_length", "train/action_std"),
         *("train/learning_rate", "loss/value", "loss/surrogate", "speed/samples_per_s"),
     }
     for name, curve in curves.items():
         assert [samples for samples, _ in curve] == [80, 160], name
         assert all(math.isfinite(value) for _, value in curve), name
-    assert [value for _, value in curves["fault/non_finite_worlds"]] == [0.0, 0.0]
+    assert [value for _, value in curves["fault/non_finite_state"]] == [0.0, 0.0]
     assert 0.0 < curves["reward/cmd"][0][1] <= 0.35  # k_xy + k_w
     assert curves["reward/diff"][0][1] < 0.0
 

@@ -1,0 +1,51 @@
+"""What can go wrong with a world, and the record of the first time that it did.
+
+A faulty world is counted, ends its episode and starts anew; the others never notice. Of each kind the first world is kept as
+it was before the step that broke it, so that the step can be repeated: `play.py --replay`.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from telebip.sim.base import ENGINE_FAULTS
+
+KINDS = ("non_finite_action", "non_finite_state", *ENGINE_FAULTS)
+"""Rows of a step's faults (kinds, num_envs): the policy's, the physics', and those that the engine reports itself."""
+
+
+class FaultRecorder:
+    """The first faulty world of each kind, kept on the device until asked for."""
+
+    def __init__(self, num_envs: int, device: torch.device) -> None:
+        """Start with nothing seen."""
+        self._seen = torch.zeros(len(KINDS), dtype=torch.bool, device=device)
+        self._world = torch.arange(num_envs, device=device)
+        self._records: dict[str, Tensor] = {}
+        self._taken: set[str] = set()
+
+    def note(self, faults: Tensor, world: Mapping[str, Tensor], step: int) -> None:
+        """Keep the first faulty world of each kind that has none yet; masks and gathers of fixed shape.
+
+        Args:
+            faults: bool, (kinds, num_envs).
+            world: what to keep, (num_envs, ...) each: all that the step's outcome depended on.
+            step: number of this step.
+        """
+        if faults.is_cpu and not faults.numpy().any():
+            return  # on a CPU, asking costs nothing
+        first, new = faults.byte().argmax(1), faults.any(1) & ~self._seen
+        steps = torch.full_like(self._world, step)
+        for name, value in {"step": steps, "world": self._world, **world}.items():
+            rows = value.index_select(0, first)
+            kept = self._records.setdefault(name, torch.zeros_like(rows))
+            kept.copy_(torch.where(new.view(-1, *[1] * (rows.dim() - 1)), rows, kept))
+        self._seen |= new
+
+    def take(self) -> dict[str, dict[str, Any]]:
+        """Return the records not yet taken, by kind: this waits for the device."""
+        new = [(row, kind) for row, kind in enumerate(KINDS) if kind not in self._taken and self._seen[row]]
+        self._taken.update(kind for _, kind in new)
+        return {kind: {name: value[row].cpu().clone() for name, value in self._records.items()} for row, kind in new}
