@@ -166,18 +166,19 @@ class Trainer:
         """Write `model_<iteration>.pt`, to go on from, and `policy.pt`, the actor alone; the first process does.
 
         Returns:
-            Whether that worked. Where the disk is full, say, `note` tells, and what was there before stays.
+            Whether that worked, the same in every process. Where the disk is full, say, `note` tells, and what was there stays.
         """
-        training = self.ranks.gather(self._training_state())
-        if not self.ranks.is_main:
-            return True
-        try:
-            self._write(self.run_dir, training)
-        except OSError as error:
-            self.note(f"cannot save to '{self.run_dir}': {error.strerror or error}; training goes on and will try again")
+        training, failed = self.ranks.gather(self._training_state()), False
+        if self.ranks.is_main:
+            try:
+                self._write(self.run_dir, training)
+                prune_checkpoints(self.run_dir, self.env.cfg.ppo.keep_checkpoints)
+            except OSError as error:
+                failed = True
+                self.note(f"cannot save to '{self.run_dir}': {error.strerror or error}; training goes on and will try again")
+        if self.ranks.any(failed, self.env.device):
             return False
         self._saved = self.iteration
-        prune_checkpoints(self.run_dir, self.env.cfg.ppo.keep_checkpoints)
         return True
 
     def checkpoint_bytes(self) -> int:
@@ -191,9 +192,11 @@ class Trainer:
         """Save what must not be lost: to the run's folder or, where that fails, to the system's folder for temporary files."""
         if self._saved == self.iteration or self.save():
             return
-        spare = Path(tempfile.mkdtemp(prefix=f"telebip_{self.run_dir.name}_"))
+        spare, training = Path(tempfile.gettempdir()), self.ranks.gather(self._training_state())
         try:
-            self._write(spare, [self._training_state()])
+            if self.ranks.is_main:
+                spare = Path(tempfile.mkdtemp(prefix=f"telebip_{self.run_dir.name}_"))
+                self._write(spare, training)
         except OSError as error:
             raise UserError(f"cannot save to '{self.run_dir}' nor to '{spare}': {error.strerror or error}") from error
         raise UserError(f"could not save to '{self.run_dir}'; the checkpoint is in '{spare}': move it there to go on")
@@ -227,6 +230,8 @@ class Trainer:
         """
         for kind, record in self.env.take_faults().items():
             said = self.env.sim.advice.get(kind, "")
+            if not self.ranks.is_main:
+                continue  # the first process alone writes
             try:
                 dumped = f"dumped to {save_fault(self.run_dir, kind, record, self.task, self.env)}, for play --replay"
             except OSError as error:
