@@ -247,13 +247,13 @@ class EngineCall:
 @contextmanager
 def recorded(env: TelebipEnv) -> Iterator[tuple[list[Tensor], list[EngineCall]]]:
     """Note down the actions of each `env.step`, and its call of the engine."""
-    actions: list[Tensor] = []
+    walked: list[Tensor] = []
     calls: list[EngineCall] = []
     step, advance = env.step, env.sim.step
 
-    def env_step(action: Tensor):
-        actions.append(action.clone())
-        return step(action)
+    def env_step(actions: Tensor):
+        walked.append(actions.clone())
+        return step(actions)
 
     def sim_step(targets: Tensor, wrench_w: Tensor):
         memory, fields = ({name: x.clone() for name, x in part.items()} for part in (env.sim.memory, env.sim.model_fields))
@@ -262,7 +262,7 @@ def recorded(env: TelebipEnv) -> Iterator[tuple[list[Tensor], list[EngineCall]]]
 
     env.step, env.sim.step = env_step, sim_step
     try:
-        yield actions, calls
+        yield walked, calls
     finally:
         del env.step, env.sim.step
 
