@@ -4,21 +4,6 @@ import torch
 from torch import Tensor
 
 
-def quat_mul(a: Tensor, b: Tensor) -> Tensor:
-    """Return the Hamilton product a b, (..., 4): the rotation b followed by a."""
-    aw, ax, ay, az = a.unbind(-1)
-    bw, bx, by, bz = b.unbind(-1)
-    return torch.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        dim=-1,
-    )
-
-
 def rotate_inverse(quat: Tensor, vec: Tensor) -> Tensor:
     """Express `vec` (..., 3), given in the world frame, in the frame whose orientation is the unit `quat` (..., 4).
 
