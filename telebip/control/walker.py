@@ -182,7 +182,7 @@ class Walker:
             ang_mom=body.ang_mom[:2] + orbital,
         )
         time_left = cfg.step_time * (1.0 - self._phase)
-        step = Step(self._side, time_left, self._velocity + self._speed, cfg.step_time, cfg.step_width)
+        step = Step(self._side, time_left, self._velocity + self._speed, cfg.step_time, cfg.step_width, cfg.error_kept)
         t_x, t_y = self.place(pendulum, step)
         # Without a hip yaw joint the robot turns by stepping further with one foot than with the other.
         t_x = t_x + self._side * (cfg.steering_gain * body.heading).clamp(-cfg.steering_limit, cfg.steering_limit)
