@@ -2,7 +2,9 @@
 
 Y. Gong and J. W. Grizzle, "Zero dynamics, pendulum models, and angular momentum in feedback control of bipedal locomotion",
 Journal of Dynamic Systems, Measurement, and Control 144 (2022); "One-step ahead prediction of angular momentum about the
-contact point for control of bipedal locomotion: validation in a LIP-inspired controller", ICRA 2021.
+contact point for control of bipedal locomotion: validation in a LIP-inspired controller", ICRA 2021. Taking back a part of the
+error with each step, where they take all of it: the poles of the step-to-step map in X. Xiong and A. Ames, "3-D underactuated
+bipedal walking via H-LIP based gait synthesis and stepping stabilization", IEEE Transactions on Robotics 38 (2022).
 """
 
 import torch
@@ -38,10 +40,14 @@ def foot_placement(pendulum: Pendulum, step: Step) -> Tensor:
     contact it becomes L* = cosh(w T) L^ + m H w sinh(w T) (-t_x, or t_y about x), so that
 
         t_x = (cosh(w T) L^_y - L*_y) / (m H w sinh(w T)),    t_y = (L*_x - cosh(w T) L^_x) / (m H w sinh(w T))
-        L*_y = m H v_x k,    L*_x = -m H v_y k - s m H (W / 2) w sinh(w T) / (1 + cosh(w T)),    k = (w T / 2) / tanh(w T / 2)
+        L* = P(-s) + a (L^ - P(s))
+        P_y = m H v_x k,    P_x(s) = -m H v_y k + s m H (W / 2) w sinh(w T) / (1 + cosh(w T)),    k = (w T / 2) / tanh(w T / 2)
 
-    where k makes v the mean speed and the last term is the sway of stepping in place. (Gong and Grizzle aim at m H v_x; k is
-    the correction from the speed in the middle of the step to the mean.)
+    P(s) is the momentum with which the walk that repeats ends a step on side s: k makes v the mean speed (Gong and Grizzle aim
+    at m H v_x; k is the correction from the speed in the middle of the step), and the last term is the sway of stepping in
+    place. A step leaves the share a of the momentum's error. At a = 0, Gong and Grizzle's law, nothing is left, but the steps
+    that this takes after a push run into the bound of the reach, and throwing the leg so far turns the robot. At a = e^{-w T}
+    the answer to an error is smaller by the factor tanh(w T): the DCM walker's, were L just m H times the velocity.
 
     Args:
         pendulum: the present state.
@@ -52,9 +58,10 @@ def foot_placement(pendulum: Pendulum, step: Step) -> Tensor:
     """
     mh = pendulum.mass * pendulum.height
     sinh, cosh = torch.sinh(pendulum.rate * step.time), torch.cosh(pendulum.rate * step.time)
-    at_touch_down = predict_ang_mom(pendulum, step.time_left) * cosh
-    wanted = mh * mean_to_end_speed(pendulum.rate, step.time) * step.velocity
+    at_touch_down = predict_ang_mom(pendulum, step.time_left)
+    along, across = mh * mean_to_end_speed(pendulum.rate, step.time) * step.velocity
     sway = step.side * mh * (0.5 * step.width) * pendulum.rate * sinh / (1.0 + cosh)
-    t_x = at_touch_down[1] - wanted[0]
-    t_y = -wanted[1] - sway - at_touch_down[0]
-    return torch.stack([t_x, t_y]) / (mh * pendulum.rate * sinh)
+    error = at_touch_down - torch.stack([sway - across, along])
+    wanted = torch.stack([-sway - across, along]) + step.error_kept * error
+    missing = wanted - cosh * at_touch_down
+    return torch.stack([-missing[1], missing[0]]) / (mh * pendulum.rate * sinh)

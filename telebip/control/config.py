@@ -13,6 +13,7 @@ class WalkerConfig:
     step_time: float = quantity("s", gt=0)
     start_phase: float = quantity(ge=0, lt=1)
     step_width: float = quantity("m", gt=0)
+    error_kept: float = quantity(ge=0, lt=1)
     hip_height: float = quantity("m", gt=0)
     heading_filter: float = quantity("s", gt=0)
     acceleration: float = quantity("m/s^2", gt=0)

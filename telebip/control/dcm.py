@@ -24,28 +24,33 @@ def predict_dcm(pendulum: Pendulum, time: Tensor) -> Tensor:
     return (pendulum.pos + pendulum.vel / pendulum.rate) * torch.exp(pendulum.rate * time)
 
 
-def dcm_offset(rate: Tensor, step: Step) -> Tensor:
-    r"""Offset of the DCM from the new contact at touch-down that repeats from step to step.
+def dcm_offset(rate: Tensor, step: Step, side: Tensor) -> Tensor:
+    r"""Offset of the DCM from a new contact at touch-down that repeats from step to step.
 
-        b = (v_x T / (e^{w T} - 1), v_y T / (e^{w T} - 1) + s W / (1 + e^{w T}))
+        b(s) = (v_x T / (e^{w T} - 1), v_y T / (e^{w T} - 1) - s W / (1 + e^{w T}))
 
     Over a step the offset grows by e^{w T} and the contact moves on by v T, and by W to the other side.
 
     Args:
         rate: w [1/s], (num_envs,).
         step: the wanted walk.
+        side: s of the new contact, +1 left and -1 right, (num_envs,).
 
     Returns:
         b [m], (2, num_envs).
     """
     growth = torch.exp(rate * step.time)
     offset = step.velocity * (step.time / (growth - 1.0))
-    offset[1] += step.side * step.width / (1.0 + growth)
+    offset[1] -= side * step.width / (1.0 + growth)
     return offset
 
 
 def foot_placement(pendulum: Pendulum, step: Step) -> Tensor:
-    r"""Touch down at the repeating offset from the DCM of that time, p = xi_T - b; t = p - c_T.
+    r"""Touch down at the repeating offset from the DCM of that time.
+
+        p = xi_T - b(-s) - a (e^{-w T} xi_T - b(s)),    t = p - c_T
+
+    The share a of the DCM's error xi_T - e^{w T} b(s) stays at the end of the next step; Englsberger's law has a = 0.
 
     Args:
         pendulum: the present state.
@@ -54,5 +59,7 @@ def foot_placement(pendulum: Pendulum, step: Step) -> Tensor:
     Returns:
         Touch-down relative to the centre of mass then, (t_x, t_y) [m], (2, num_envs).
     """
-    contact = predict_dcm(pendulum, step.time_left) - dcm_offset(pendulum.rate, step)
-    return contact - pendulum.pos_after(step.time_left)
+    dcm = predict_dcm(pendulum, step.time_left)
+    present, coming = (dcm_offset(pendulum.rate, step, side) for side in (step.side, -step.side))
+    error = dcm * torch.exp(-pendulum.rate * step.time) - present
+    return dcm - coming - step.error_kept * error - pendulum.pos_after(step.time_left)

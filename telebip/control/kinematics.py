@@ -103,8 +103,8 @@ class Kinematics:
             ang_vel: w, trunk frame [rad/s], (3, num_envs).
         """
         (roll, pitch, knee), (roll_vel, pitch_vel, knee_vel) = joint_pos, joint_vel
-        (sr, cr), (sp, cp) = (roll.sin(), roll.cos()), (pitch.sin(), pitch.cos())
-        pitch_axis, k = torch.stack([torch.zeros_like(sr), cr, sr]), torch.stack([sp, -sr * cp, cr * cp])
+        sr, cr = roll.sin(), roll.cos()
+        pitch_axis, k = torch.stack([torch.zeros_like(sr), cr, sr]), leg_axis(roll, pitch)
         leg_rate = ang_vel[:, None] + pitch_vel * pitch_axis
         leg_rate[0] += roll_vel
         n, a = cross(leg_rate, k), cross(ang_vel[:, None], self.hip)
@@ -155,6 +155,11 @@ class Kinematics:
         stretch = (leg * leg_vel).sum(0) / length2  # l' / l
         roll, pitch = (y * vz - z * vy) / across2, (x * stretch - vx) * torch.rsqrt(across2)
         return torch.stack([roll, pitch, -stretch * length2.sqrt()])
+
+
+def leg_axis(roll: Tensor, pitch: Tensor) -> Tensor:
+    """Return k, the unit vector from foot to hip, trunk frame, (3, ...); see the module's equation."""
+    return torch.stack([pitch.sin(), -roll.sin() * pitch.cos(), roll.cos() * pitch.cos()])
 
 
 def joint_forces(pitch_axis: Tensor, knee_axis: Tensor, arm: Tensor, force: Tensor) -> Tensor:

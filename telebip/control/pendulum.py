@@ -33,6 +33,7 @@ class Step:
     velocity: Tensor  # wanted (v_x, v_y) [m/s], (2, num_envs)
     time: float  # T, of every step [s]
     width: float  # W, lateral distance of the feet when walking in place [m]
+    error_kept: float  # a, share of the momentum's or the DCM's error that the next step leaves [-]
 
 
 Placement = Callable[[Pendulum, Step], Tensor]

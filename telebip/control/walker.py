@@ -13,7 +13,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from telebip.control.config import WalkerConfig
-from telebip.control.kinematics import Kinematics, Motion, cross, joint_forces, rotate, rotate_back
+from telebip.control.kinematics import Kinematics, Motion, cross, joint_forces, leg_axis, rotate, rotate_back
 from telebip.control.legs import Hold, stance_force, swing_path
 from telebip.control.pendulum import Pendulum, Placement, Step
 from telebip.math import matrix, wrap_angle
@@ -88,14 +88,15 @@ class Walker:
         body = self._observe(obs["policy"].T)
         self._begin_steps(body)
         stance_foot, _ = self._stance_and_swing(body.foot)
-        (stance_pos, swing_pos), (stance_vel, swing_vel) = map(self._stance_and_swing, (body.joint_pos, body.joint_vel))
+        stance_pos, swing_pos = self._stance_and_swing(body.joint_pos)
+        _, swing_vel = self._stance_and_swing(body.joint_vel)
         arm = body.com - stance_foot
 
-        swing_target = self._swing_target(body, arm, self._touch_down(body, arm))
+        swing_target = self._swing_target(body, arm, self._touch_down(body, arm), swing_pos + 0.5 * self.step_dt * swing_vel)
         swing_force = self.hold.force(swing_target, swing_pos, swing_vel)
         stance_joint_force = self._stance_joint_force(body, arm, stance_foot)
         stance_joint_force[:2] -= swing_force[:2]  # what moves the swing leg at its hip turns the trunk back
-        stance_target = self.hold.target(stance_pos, stance_vel, stance_joint_force)
+        stance_target = self.hold.target(stance_pos, self._stance_joint_vel(body), stance_joint_force)
         self._advance(body)
 
         left_stands = self._side > 0.0
@@ -182,7 +183,7 @@ class Walker:
             ang_mom=body.ang_mom[:2] + orbital,
         )
         time_left = cfg.step_time * (1.0 - self._phase)
-        step = Step(self._side, time_left, self._velocity + self._speed, cfg.step_time, cfg.step_width)
+        step = Step(self._side, time_left, self._velocity + self._speed, cfg.step_time, cfg.step_width, cfg.error_kept)
         t_x, t_y = self.place(pendulum, step)
         # Without a hip yaw joint the robot turns by stepping further with one foot than with the other.
         t_x = t_x + self._side * (cfg.steering_gain * body.heading).clamp(-cfg.steering_limit, cfg.steering_limit)
@@ -192,8 +193,13 @@ class Walker:
         distance = (-self._side * (t_y + sway)).clamp(*cfg.feet_distance)
         return torch.stack([t_x, -self._side * distance - sway])
 
-    def _swing_target(self, body: Body, arm: Tensor, touch_down: Tensor) -> Tensor:
-        """Joint targets of the swing leg [rad | m], (3, num_envs): its path in the middle of the coming policy step."""
+    def _swing_target(self, body: Body, arm: Tensor, touch_down: Tensor, joint_pos: Tensor) -> Tensor:
+        """Joint targets of the swing leg [rad | m], (3, num_envs): its path in the middle of the coming policy step.
+
+        `joint_pos` is where the joints will be by then. The leg's length l puts the foot at the path's height in the direction
+        k that the leg then has, l = -(e . r) / (e . k) with e upwards and r from the hip to the path. The hip lags behind a
+        touch-down that moves on late in the step, and a leg as long as it takes there would hit the ground on the way.
+        """
         kin = self.kinematics
         phase = self._phase + 0.5 * self.step_dt / self.cfg.step_time
         pos, vel = swing_path(self._lift_off, touch_down, phase.clamp(max=1.0), self.cfg)
@@ -202,7 +208,23 @@ class Walker:
         foot = rotate_back(body.to_plan, pos) + body.motion.com  # from the trunk's origin, trunk frame
         foot_vel = rotate_back(body.to_plan, vel) + body.motion.com_vel - cross(body.ang_vel, foot)
         leg = foot - torch.where(self._side > 0.0, kin.hip[:, 0], kin.hip[:, 1])
-        return kin.inverse(leg) + kin.damping * kin.inverse_rate(leg, foot_vel) / kin.stiffness
+        roll, pitch, _ = kin.inverse(leg)
+        up, axis = body.to_plan[2], leg_axis(joint_pos[0], joint_pos[1])
+        length = -(up * leg).sum(0) / (up * axis).sum(0).clamp(min=0.1)  # finite answers to a robot that lies on the ground
+        target = torch.stack([roll, pitch, kin.leg_length - length])
+        return target + kin.damping * kin.inverse_rate(leg, foot_vel) / kin.stiffness
+
+    def _stance_joint_vel(self, body: Body) -> Tensor:
+        """Joint velocities of the stance leg on a resting foot [rad/s | m/s], (3, num_envs).
+
+        The measured ones are the same but for a touch-down: the foot still moves with the body when it is observed, stops
+        within the call, and the knee's damping, which nothing made up for, would throw the robot up.
+        """
+        kin = self.kinematics
+        leg, _ = self._stance_and_swing(body.motion.leg)
+        foot = leg + torch.where(self._side > 0.0, kin.hip[:, 1], kin.hip[:, 0])  # from the trunk's origin, trunk frame
+        leg_vel = -rotate_back(body.to_plan, body.hip_vel) - cross(body.ang_vel, foot)
+        return kin.inverse_rate(leg, leg_vel)
 
     def _stance_joint_force(self, body: Body, arm: Tensor, stance_foot: Tensor) -> Tensor:
         """Joint forces of the stance leg, as if the other one had no mass [N m | N], (3, num_envs)."""

@@ -23,9 +23,9 @@ def pendulum(pos: Tensor, vel: Tensor) -> Pendulum:
     return Pendulum(MASS, HEIGHT * ones, RATE * ones, pos, vel, ang_mom)
 
 
-def step(side: Tensor, time_left: float, velocity: tuple[float, float]) -> Step:
-    ones = torch.ones_like(side)
-    return Step(side, time_left * ones, torch.tensor(velocity, dtype=torch.float64)[:, None].expand(2, len(side)), TIME, WIDTH)
+def step(side: Tensor, time_left: float, velocity: tuple[float, float], kept: float = 0.0) -> Step:
+    ones, wanted = torch.ones_like(side), torch.tensor(velocity, dtype=torch.float64)[:, None].expand(2, len(side))
+    return Step(side, time_left * ones, wanted, TIME, WIDTH, kept)
 
 
 def integrate(pos: Tensor, vel: Tensor, time: float, steps: int = 400) -> tuple[Tensor, Tensor]:
@@ -74,12 +74,14 @@ def orbit(side: float, velocity: tuple[float, float]) -> tuple[Tensor, Tensor]:
     return torch.tensor([[x], [y]], dtype=torch.float64), torch.tensor([[v_x], [v_y]], dtype=torch.float64)
 
 
-def walk(place: Placement, state: tuple[Tensor, Tensor], side: Tensor, velocity: tuple[float, float], steps: int):
+def walk(
+    place: Placement, state: tuple[Tensor, Tensor], side: Tensor, velocity: tuple[float, float], steps: int, kept: float = 0.0
+):
     """Yield the state after each touch-down, relative to the new contact, and the way from the old contact to the new."""
     pos, vel = state
     for _ in range(steps):
         pos, vel = integrate(pos, vel, 0.4 * TIME, 100)  # the law answers the same at any time of the step
-        contact = place(pendulum(pos, vel), step(side, 0.6 * TIME, velocity))
+        contact = place(pendulum(pos, vel), step(side, 0.6 * TIME, velocity, kept))
         pos, vel = integrate(pos, vel, 0.6 * TIME, 100)
         way = pos + contact
         pos, side = -contact, -side
@@ -89,10 +91,11 @@ def walk(place: Placement, state: tuple[Tensor, Tensor], side: Tensor, velocity:
 @LAWS
 @pytest.mark.parametrize("side", [1.0, -1.0])
 @pytest.mark.parametrize("velocity", [(0.7, 0.0), (-0.3, 0.0), (0.0, 0.0), (0.5, 0.2)])
-def test_the_periodic_walk_repeats(place: Placement, side: float, velocity: tuple[float, float]) -> None:
+@pytest.mark.parametrize("kept", [0.0, 0.4])
+def test_the_periodic_walk_repeats(place: Placement, side: float, velocity: tuple[float, float], kept: float) -> None:
     sides = torch.tensor([side], dtype=torch.float64)
     s = side
-    for pos, vel, way in walk(place, orbit(side, velocity), sides, velocity, 6):
+    for pos, vel, way in walk(place, orbit(side, velocity), sides, velocity, 6, kept):
         s = -s
         expected_pos, expected_vel = orbit(s, velocity)
         torch.testing.assert_close(pos, expected_pos, atol=1e-9, rtol=0.0)
@@ -114,6 +117,28 @@ def test_a_disturbed_walk_returns(place: Placement, start: tuple[Tensor, Tensor]
     assert errors[-1] < 1e-6
     if place is alip.foot_placement:
         assert errors[3] < 0.1 * errors[0]
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.4, 0.7])
+@pytest.mark.parametrize(
+    ("place", "predict"),
+    [(alip.foot_placement, alip.predict_ang_mom), (dcm.foot_placement, dcm.predict_dcm)],
+    ids=["alip", "dcm"],
+)
+def test_a_step_leaves_the_given_share_of_the_error(
+    place: Placement, predict: Callable[[Pendulum, Tensor], Tensor], start: tuple[Tensor, Tensor], kept: float
+) -> None:
+    side, time = torch.ones(8, dtype=torch.float64), torch.full((8,), TIME, dtype=torch.float64)
+
+    def at_end(pos: Tensor, vel: Tensor) -> Tensor:
+        return predict(pendulum(pos, vel), time)
+
+    wanted = {s: at_end(*orbit(s, (0.7, 0.1))) for s in (1.0, -1.0)}
+    error = at_end(*start) - wanted[1.0]
+    for k, (pos, vel, _) in enumerate(walk(place, start, side, (0.7, 0.1), 5, kept)):
+        left = at_end(pos, vel) - wanted[-1.0 if k % 2 == 0 else 1.0]
+        torch.testing.assert_close(left, kept * error, atol=1e-7, rtol=0.0)
+        error = left
 
 
 @LAWS

@@ -67,6 +67,23 @@ def test_it_withstands_the_tasks_pushes_friction_and_noise(make_env: MakeEnv, na
     assert walk(env, name, (0.7, 0.0, 0.0), 6.0).fallen.sum() <= 1
 
 
+@NAMES
+def test_a_forward_push_neither_fells_it_nor_makes_it_jump(make_env: MakeEnv, name: str) -> None:
+    """120 N for 0.1 s, in each world from another moment of the stride on."""
+    env = make_env("episode.reset_heading=0", calm=True, num_envs=24)
+    env.set_command(0.7, 0.0, 0.0)
+    policy, start = make_controller(name, env), 100 + torch.arange(24)
+    rise, fallen = torch.zeros(24), torch.zeros(24, dtype=torch.bool)
+    for step in range(200):
+        since = step - start
+        env.push_wrench_w[:, 0] = 120.0 * ((since >= 0) & (since < 5))
+        _, _, dones, _ = env.step(policy(env.get_observations()))
+        rise = torch.maximum(rise, torch.where(since < 0, 0.0, env.sim.state.base_lin_vel_w[:, 2]))
+        fallen |= dones
+    assert not fallen.any()
+    assert rise.max() < 0.35  # m/s
+
+
 def mirror(obs: Tensor) -> Tensor:
     """Reflect observations in the plane y = 0: legs change sides; y, roll and yaw change sign."""
     leg = torch.tensor([-1.0, 1.0, 1.0]).repeat(2)
