@@ -5,10 +5,10 @@ import math
 import pytest
 import torch
 from torch import Tensor
-from worlds import MakeEnv, observe, put, random_actions
+from worlds import MakeEnv, observe, put, quat_mul, random_actions
 
 from telebip.env import TelebipEnv
-from telebip.math import quat_from_yaw, quat_mul, wrap_angle
+from telebip.math import quat_from_yaw, wrap_angle
 
 
 def turned(env: TelebipEnv, angle: float) -> tuple[Tensor, Tensor]:

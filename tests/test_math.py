@@ -7,6 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
+from worlds import quat_mul
 
 from telebip.math import quat_from_yaw, rotate_inverse, turn, wrap_angle, yaw
 
@@ -37,21 +38,6 @@ def matrix(quat: Tensor) -> Tensor:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ],
         dtype=torch.float64,
-    )
-
-
-def quat_mul(a: Tensor, b: Tensor) -> Tensor:
-    """Return the Hamilton product a b, (..., 4): the rotation b followed by a."""
-    aw, ax, ay, az = a.unbind(-1)
-    bw, bx, by, bz = b.unbind(-1)
-    return torch.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        dim=-1,
     )
 
 

@@ -38,6 +38,21 @@ def put_low(env: TelebipEnv, worlds: list[int]) -> None:
     put(env, worlds, qpos, torch.zeros(env.num_envs, 12))
 
 
+def quat_mul(a: Tensor, b: Tensor) -> Tensor:
+    """Return the Hamilton product a b, (..., 4): the rotation b followed by a."""
+    aw, ax, ay, az = a.unbind(-1)
+    bw, bx, by, bz = b.unbind(-1)
+    return torch.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        dim=-1,
+    )
+
+
 class HostReads(TorchDispatchMode):
     """Notes the operators that wait for the device, or whose result's shape depends on the data."""
 

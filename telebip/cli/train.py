@@ -111,13 +111,13 @@ def train(
         if trainer.iteration >= total:
             console.print(f"{run_dir} has finished its {total} iterations; raise --max-iterations to train on")
             return True
-        backend = type(env.sim).__name__.removesuffix("Simulator").lower()
+        engine = type(env.sim).__name__.removesuffix("Simulator").lower()
         if ranks.is_main:
             require_space(run_dir, trainer.checkpoint_bytes(), config.ppo.keep_checkpoints)
-            describe_run(run_dir, config, str(device), backend, ranks.size)
+            describe_run(run_dir, config, str(device), engine, ranks.size)
         arithmetic = "bfloat16" if trainer.learner.use_mixed_precision else "float32"
         worlds = f"{config.num_envs} worlds" if ranks.size == 1 else f"{ranks.size} processes x {config.num_envs} worlds"
-        console.print(f"{task}: {worlds} on {device} ({backend}), update in {arithmetic}, writing to {run_dir}")
+        console.print(f"{task}: {worlds} on {device} ({engine}), update in {arithmetic}, writing to {run_dir}")
         if trainer.iteration:
             console.print(f"resuming after iteration {trainer.iteration} of {total}")
         if restart:
