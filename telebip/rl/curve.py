@@ -2,7 +2,8 @@
 
 import csv
 import io
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from telebip.files import write_atomically
@@ -17,20 +18,26 @@ class CurveWriter:
         """Open the file of `run_dir`, keeping its rows up to `samples` environment steps."""
         self._path = run_dir / FILE
         rows = read_curve(run_dir) if self._path.exists() else []
-        kept, text = [row for row in rows if row["samples"] <= samples], io.StringIO(newline="")
-        if kept:
-            writer = csv.DictWriter(text, list(kept[0]))
-            writer.writeheader()
-            writer.writerows({name: f"{value:.6g}" for name, value in row.items()} for row in kept)
-        write_atomically(self._path, text.getvalue().encode())
+        self._columns: list[str] = []
+        self._write([row for row in rows if row["samples"] <= samples])
 
     def add(self, row: Mapping[str, float]) -> None:
-        """Append one iteration's numbers; the first row names the columns."""
+        """Append one iteration's numbers; where an older version wrote other columns, they are NaN, as are its in this row."""
+        if not row.keys() <= set(self._columns):
+            self._columns += [name for name in row if name not in self._columns]
+            self._write(read_curve(self._path.parent))
         with self._path.open("a", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, list(row))
-            if file.tell() == 0:
-                writer.writeheader()
-            writer.writerow({name: f"{value:.6g}" for name, value in row.items()})
+            csv.writer(file).writerow(f"{row.get(name, math.nan):.6g}" for name in self._columns)
+
+    def _write(self, rows: Sequence[Mapping[str, float]]) -> None:
+        """Write the file anew."""
+        self._columns = list(dict.fromkeys([*(rows[0] if rows else ()), *self._columns]))
+        text = io.StringIO(newline="")
+        writer = csv.writer(text)
+        if self._columns:
+            writer.writerow(self._columns)
+        writer.writerows([f"{row.get(name, math.nan):.6g}" for name in self._columns] for row in rows)
+        write_atomically(self._path, text.getvalue().encode())
 
 
 def read_curve(run_dir: Path) -> list[dict[str, float]]:

@@ -12,6 +12,7 @@ from telebip.env import TelebipEnv
 from telebip.errors import UserError
 from telebip.mdp.rewards import REWARDS
 from telebip.rl.checkpoint import load_checkpoint
+from telebip.rl.curve import CurveWriter, read_curve
 from telebip.rl.log import EpisodeStatistics
 from telebip.rl.policy import load_policy
 from telebip.rl.train import Trainer, min_std
@@ -120,6 +121,20 @@ def test_a_checkpoint_of_other_networks_is_refused_in_one_line(robot: Robot, tmp
 def test_more_mini_batches_than_samples_are_refused(robot: Robot, tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"ppo.num_mini_batches is 81, but an iteration has only 8 worlds x 10 steps"):
         trainer(robot, tmp_path, 1, "ppo.num_mini_batches=81")
+
+
+def test_a_curve_takes_new_columns(tmp_path: Path) -> None:
+    """As when a run goes on with a version that logs more, or less."""
+    older = CurveWriter(tmp_path, 0)
+    older.add({"samples": 1.0, "old": 2.0})
+    newer = CurveWriter(tmp_path, 1)
+    newer.add({"samples": 2.0, "new": 3.0})
+    first, second = read_curve(tmp_path)
+    assert (first["samples"], first["old"], second["samples"], second["new"]) == (1.0, 2.0, 2.0, 3.0)
+    assert math.isnan(first["new"]) and math.isnan(second["old"])
+    with (tmp_path / "learning.csv").open("a") as file:
+        file.write("3,4")  # killed while it was writing
+    assert len(read_curve(tmp_path)) == 2
 
 
 def test_episode_statistics_by_hand() -> None:
