@@ -26,7 +26,7 @@ from typing import Any
 
 import torch
 from rsl_rl.algorithms import PPO
-from torch import Tensor
+from torch import Tensor, nn
 
 from telebip.config import TaskConfig
 from telebip.env import TelebipEnv
@@ -274,7 +274,8 @@ def allocated_bytes(device: torch.device) -> int:
         torch.cuda.empty_cache()
         free, total = torch.cuda.mem_get_info(device)
         return total - free
-    storages = [x.untyped_storage() for x in gc.get_objects() if issubclass(type(x), Tensor) and x.device == device]
+    kinds = (Tensor, nn.Parameter)  # torch's stand-ins for tensors, as exports leave them, have no memory
+    storages = [x.untyped_storage() for x in gc.get_objects() if type(x) in kinds and x.device == device]
     covered = end = 0
     for low, high in sorted((s.data_ptr(), s.data_ptr() + s.nbytes()) for s in storages):  # views of one array overlap
         covered += max(0, high - max(low, end))
