@@ -150,7 +150,7 @@ def test_a_killed_training_goes_on_bit_for_bit(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_twenty_kills_change_nothing(tmp_path: Path) -> None:
-    assert_killing_changes_nothing(tmp_path, iterations=1500, kills=20, wait=1.5)
+    assert_killing_changes_nothing(tmp_path, iterations=500, kills=20, wait=0.6)
 
 
 class DieWriting:
