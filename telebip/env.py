@@ -11,7 +11,7 @@ from torch import Tensor
 from telebip.config import TaskConfig
 from telebip.math import rotate_inverse, wrap_angle, yaw
 from telebip.mdp import gait, terminations
-from telebip.mdp.actions import joint_targets
+from telebip.mdp.actions import action_scale, joint_targets
 from telebip.mdp.commands import hold_heading
 from telebip.mdp.context import StepContext
 from telebip.mdp.curriculum import ramp
@@ -77,7 +77,7 @@ class TelebipEnv(VecEnv):
 
         window = gait.window_length(cfg.gait.period, self.step_dt)
         self._home_qpos, self._nominal, self._force_limit = map(constant, (robot.home_qpos, robot.nominal, robot.force_limit))
-        self._action_scale = constant([cfg.action.hip_roll, cfg.action.hip_pitch, cfg.action.knee] * 2)
+        self._action_scale = constant(action_scale(cfg.action))
         self._draws = Draws(ranges(cfg), self.device)
         self._foot_weights = constant(gait.window_weights(window, cfg.reward.foot.gamma, cfg.reward.foot.first))
         self._friction = self.sim.model_fields["geom_friction"][:, robot.engine_floor_id, 0]  # live, one per world
@@ -221,8 +221,7 @@ class TelebipEnv(VecEnv):
 
     def state_dict(self) -> dict[str, Any]:
         """Return a copy of all that the worlds' future depends on; `load_state_dict` goes on from it, bit for bit."""
-        live = {"sim": self.sim.memory, "model": self.sim.model_fields, "mdp": {name: getattr(self, name) for name in MEMORY}}
-        copies = {part: {name: value.clone() for name, value in values.items()} for part, values in live.items()}
+        copies = {part: {name: value.clone() for name, value in values.items()} for part, values in self._live.items()}
         return {**copies, "generator": self.generator.get_state(), "num_steps": self.num_steps}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -231,7 +230,7 @@ class TelebipEnv(VecEnv):
         Raises:
             ValueError: it has other worlds: of another number, robot, engine, or length of the gait's period.
         """
-        live = {"sim": self.sim.memory, "model": self.sim.model_fields, "mdp": {name: getattr(self, name) for name in MEMORY}}
+        live = self._live
         for part, values in live.items():
             for name, value in values.items():
                 found = state[part].get(name)
@@ -243,6 +242,11 @@ class TelebipEnv(VecEnv):
                 value.copy_(state[part][name])
         self.generator.set_state(state["generator"].cpu())
         self.num_steps = state["num_steps"]
+
+    @property
+    def _live(self) -> dict[str, dict[str, Tensor]]:
+        """The tensors themselves that the worlds' future depends on."""
+        return {"sim": self.sim.memory, "model": self.sim.model_fields, "mdp": {name: getattr(self, name) for name in MEMORY}}
 
     def take_faults(self) -> dict[str, dict[str, Any]]:
         """Return the first faulty world of each kind that has not been taken yet; see `mdp.faults`. Waits for the device."""

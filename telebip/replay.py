@@ -14,7 +14,7 @@ from telebip.env import MODEL_FIELDS, TelebipEnv
 from telebip.errors import UserError
 from telebip.eval.rollout import Rollout
 from telebip.files import write_atomically
-from telebip.mdp.actions import joint_targets
+from telebip.mdp.actions import action_scale, joint_targets
 from telebip.mdp.faults import KINDS
 from telebip.mdp.terminations import non_finite
 from telebip.robot import Robot, load_robot
@@ -80,8 +80,14 @@ def save_fault(run_dir: Path, kind: str, record: dict[str, Tensor], task: str, e
     if file.exists():
         return file
     file.parent.mkdir(exist_ok=True)
-    backend = type(env.sim).__name__.removesuffix("Simulator").lower()
-    about = {"format": FORMAT, "kind": kind, "task": task, "config": to_yaml(env.cfg), "seed": env.cfg.seed, "backend": backend}
+    about = {
+        "format": FORMAT,
+        "kind": kind,
+        "task": task,
+        "config": to_yaml(env.cfg),
+        "seed": env.cfg.seed,
+        "backend": env.sim.backend,
+    }
     archive = io.BytesIO()
     torch.save({**about, "record": record}, archive)
     write_atomically(file, archive.getvalue())
@@ -119,8 +125,9 @@ def replay(fault: Fault, backend: Backend | None = None) -> Replay:
     sim.load({name: record[name][None] for name in sim.memory})
     action = record["action"][None]
     seen = set() if action.isfinite().all() else {"non_finite_action"}
-    scale = torch.tensor([cfg.action.hip_roll, cfg.action.hip_pitch, cfg.action.knee] * 2)
-    target = joint_targets(torch.where(action.isfinite().all(), action, 0.0), torch.as_tensor(robot.nominal).float(), scale)
+    target = joint_targets(
+        torch.where(action.isfinite().all(), action, 0.0), torch.as_tensor(robot.nominal).float(), action_scale(cfg.action)
+    )
     states, faults = [_copy(sim.state)], [set(seen)]
     for _ in range(cfg.sim.decimation):
         sim.step(target, record["push_wrench_w"][None])

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from telebip.cli.common import Parser, resolve_device
+from telebip.cli.common import Parser, open_checkpoint, resolve_device
 from telebip.config import load_task, task_names
 from telebip.errors import UserError
 
@@ -42,13 +42,13 @@ def main(argv: Sequence[str] | None = None) -> None:
 
         from telebip.cli.evaluate import progress_bar
         from telebip.rl.benchmark import machine_name, measure
-        from telebip.rl.checkpoint import POLICIES, load_checkpoint
+        from telebip.rl.checkpoint import POLICIES
         from telebip.rl.process import prepare_cpu
         from telebip.rl.run import describe_code
         from telebip.robot import load_robot
 
     policy = options.checkpoint or (options.task if (POLICIES / str(options.task)).is_dir() else "telebip_flat")
-    checkpoint = load_checkpoint(policy)
+    checkpoint = open_checkpoint(policy)
     task = options.task or checkpoint.task
     configs = [load_task(options.task or checkpoint.config, [*options.overrides, f"num_envs={n}"]) for n in options.num_envs]
     if configs[0].ppo.symmetry != checkpoint.config.ppo.symmetry:

@@ -111,7 +111,7 @@ def train(
         if trainer.iteration >= total:
             console.print(f"{run_dir} has finished its {total} iterations; raise --max-iterations to train on")
             return True
-        engine = type(env.sim).__name__.removesuffix("Simulator").lower()
+        engine = env.sim.backend
         if ranks.is_main:
             require_space(run_dir, trainer.checkpoint_bytes(), config.ppo.keep_checkpoints)
             describe_run(run_dir, config, str(device), engine, ranks.size)

@@ -10,6 +10,7 @@ from telebip.control.kinematics import Kinematics
 from telebip.control.walker import Walker
 from telebip.env import TelebipEnv
 from telebip.errors import UserError, nearest
+from telebip.mdp.actions import action_scale
 
 PLACEMENTS = {"alip": alip.foot_placement, "dcm": dcm.foot_placement}
 
@@ -27,13 +28,12 @@ def make_controller(name: str, env: TelebipEnv, overrides: Sequence[str] = ()) -
     """
     if name not in PLACEMENTS:
         raise UserError(f"unknown controller '{name}'; {nearest(name, PLACEMENTS)}")
-    scale = env.cfg.action
     return Walker(
         load_controller(name, overrides),
         PLACEMENTS[name],
         Kinematics(env.robot, env.device),
         nominal=torch.as_tensor(env.robot.nominal, dtype=torch.float32, device=env.device),
-        action_scale=torch.tensor([scale.hip_roll, scale.hip_pitch, scale.knee] * 2, device=env.device),
+        action_scale=action_scale(env.cfg.action).to(env.device),
         num_envs=env.num_envs,
         step_dt=env.step_dt,
     )

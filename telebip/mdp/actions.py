@@ -1,6 +1,14 @@
 """From actions to joint targets."""
 
+import torch
 from torch import Tensor
+
+from telebip.config import ActionConfig
+
+
+def action_scale(cfg: ActionConfig) -> Tensor:
+    """Return the displacement of each joint target per unit of action [rad | m], (6,)."""
+    return torch.tensor([cfg.hip_roll, cfg.hip_pitch, cfg.knee] * 2)
 
 
 def joint_targets(action: Tensor, nominal: Tensor, scale: Tensor) -> Tensor:

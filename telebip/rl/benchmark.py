@@ -194,7 +194,7 @@ def measure(
     except torch.OutOfMemoryError as error:
         raise UserError(f"{cfg.num_envs} worlds do not fit into the memory of {device}") from error
     return {
-        "backend": type(ladder.env.sim).__name__.removesuffix("Simulator").lower(),
+        "backend": ladder.env.sim.backend,
         "device": str(device),
         "num_envs": cfg.num_envs,
         "update": "bfloat16" if ladder.uses_bfloat16 else "float32",

@@ -1,17 +1,14 @@
 """Physics backends behind one interface; see `telebip.sim.base`."""
 
 from collections.abc import Sequence
-from typing import Literal
 
 import torch
 
 from telebip.errors import UserError
 from telebip.robot import Robot
-from telebip.sim.base import SimState, Simulator
+from telebip.sim.base import Backend, SimState, Simulator
 
 __all__ = ["Backend", "SimState", "Simulator", "make_simulator"]
-
-Backend = Literal["auto", "native", "warp"]
 
 
 def make_simulator(

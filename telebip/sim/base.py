@@ -2,10 +2,12 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
 
 import torch
 from torch import Tensor
+
+Backend = Literal["auto", "native", "warp"]
 
 ENGINE_FAULTS = ("engine_warning", "engine_error", "capacity")
 """What an engine reports of a world itself: a warning, an error, or more contacts or constraints than there is room for."""
@@ -77,6 +79,8 @@ class Simulator(Protocol):
     state: SimState
     model_fields: dict[str, Tensor]
     """Live per-world copies of the model fields named at construction, (num_envs, ...); writes act from the next step."""
+    backend: Backend
+    """Its name."""
     faults: Tensor
     """Which of `ENGINE_FAULTS` befell which world in the last `step`: bool, (3, num_envs)."""
     advice: dict[str, str]

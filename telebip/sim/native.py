@@ -12,7 +12,7 @@ from mujoco.batch import Batch, SimulationError
 from torch import Tensor
 
 from telebip.robot import Robot
-from telebip.sim.base import ENGINE_FAULTS, SimState
+from telebip.sim.base import ENGINE_FAULTS, Backend, SimState
 
 CAPACITY = [mujoco.mjtWarning.mjWARN_CONTACTFULL.value, mujoco.mjtWarning.mjWARN_CNSTRFULL.value]
 """Warnings of an arena that is too small: the MJCF's `<size memory="..."/>`."""
@@ -20,6 +20,8 @@ CAPACITY = [mujoco.mjtWarning.mjWARN_CONTACTFULL.value, mujoco.mjtWarning.mjWARN
 
 class NativeSimulator:
     """`Simulator` on `mujoco.batch.Batch`: float64 inside, float32 in `state`; results do not depend on threads."""
+
+    backend: Backend = "native"
 
     def __init__(
         self,

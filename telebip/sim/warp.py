@@ -12,7 +12,7 @@ import warp as wp
 from torch import Tensor
 
 from telebip.robot import Robot
-from telebip.sim.base import ENGINE_FAULTS, SimState
+from telebip.sim.base import ENGINE_FAULTS, Backend, SimState
 
 CAPACITY = int(mjw.OverflowType.ALL & ~(mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS))
 """Overflows that truncate the physics; the MJCF's limits on solver iterations are meant."""
@@ -45,6 +45,8 @@ def _accumulate(
 
 class WarpSimulator:
     """`Simulator` on `mujoco_warp`, float32 throughout."""
+
+    backend: Backend = "warp"
 
     def __init__(
         self,
