@@ -43,6 +43,7 @@ class SimConfig:
     decimation: int = quantity(ge=1, le=1000)
     max_contacts: int = quantity(ge=1, le=10_000)
     max_constraints: int = quantity(ge=1, le=100_000)
+    cuda_graph: bool = MISSING
 
 
 @dataclass

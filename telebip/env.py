@@ -1,7 +1,7 @@
 """The vectorised environment: the order of one step, and nothing else. Every term it calls lives in `telebip.mdp`."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from rsl_rl.env import VecEnv
@@ -9,6 +9,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from telebip.config import TaskConfig
+from telebip.graph import CudaGraph
 from telebip.math import rotate_inverse, wrap_angle, yaw
 from telebip.mdp import gait, terminations
 from telebip.mdp.actions import action_scale, joint_targets
@@ -16,7 +17,7 @@ from telebip.mdp.commands import hold_heading
 from telebip.mdp.context import StepContext
 from telebip.mdp.curriculum import ramp
 from telebip.mdp.faults import KINDS, FaultRecorder
-from telebip.mdp.observations import LAYOUT, heading_relative_quat, observation
+from telebip.mdp.observations import heading_relative_quat, observation
 from telebip.mdp.randomization import Draws, initial_qpos, push_force, ranges
 from telebip.mdp.rewards import reward_terms
 from telebip.robot import Robot
@@ -27,17 +28,33 @@ MODEL_FIELDS = ("geom_friction",)
 
 MEMORY = (
     *("episode_length_buf", "last_action", "command", "target_command", "reference_heading", "push_wrench_w"),
-    *("_push_timer", "_push_time_left", "_command_timer", "_foot_window", "_base_lin_vel_b", "_noise"),
+    *("_push_timer", "_push_time_left", "_command_timer", "_foot_window", "_base_lin_vel_b", "_noise", "num_steps"),
 )
 """Buffers of the environment that outlast a step; all else is computed anew in each."""
+
+
+LOG = ("error/lin_vel_mps", "error/yaw_rate_radps", "walk/cost_of_transport", "walk/falls_per_minute", "fault/worlds")
+"""What `step` logs between the terms of the reward and the kinds of faults."""
+
+
+class Outcome(NamedTuple):
+    """What a step leaves for its caller."""
+
+    obs: Tensor  # (num_envs, 33)
+    rewards: Tensor  # (num_envs,)
+    dones: Tensor  # bool, (num_envs,)
+    time_outs: Tensor  # bool, (num_envs,)
+    log: Tensor  # means and numbers over the worlds, in the order of `log_names`
+    final_obs: Tensor | None  # (num_envs, 33)
 
 
 class TelebipEnv(VecEnv):
     """`num_envs` robots that follow velocity commands on flat ground; implements `rsl_rl.env.VecEnv`.
 
     All buffers are preallocated and written in place; choices between worlds are masks. `step` never waits for the device
-    and never changes a shape. Finished worlds are reset within the step that ends them: their reward and done flag belong to
-    the old episode, their observation to the new one.
+    and never changes a shape; on CUDA its tensor work before and after the physics is recorded and replayed as two graphs.
+    Finished worlds are reset within the step that ends them: their reward and done flag belong to the old episode, their
+    observation to the new one.
     """
 
     def __init__(
@@ -78,17 +95,21 @@ class TelebipEnv(VecEnv):
         window = gait.window_length(cfg.gait.period, self.step_dt)
         self._home_qpos, self._nominal, self._force_limit = map(constant, (robot.home_qpos, robot.nominal, robot.force_limit))
         self._action_scale = constant(action_scale(cfg.action))
-        self._draws = Draws(ranges(cfg), self.device)
+        self._draws = Draws(ranges(cfg), self.num_envs, self.device)
         self._foot_weights = constant(gait.window_weights(window, cfg.reward.foot.gamma, cfg.reward.foot.first))
         self._friction = self.sim.model_fields["geom_friction"][:, robot.engine_floor_id, 0]  # live, one per world
 
         self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)  # policy steps since reset
+        self._given = zeros(6)  # the policy's actions as they came
+        self._finite = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)  # and whether they are numbers
+        self._action = zeros(6)  # A_t, zero where they are not
         self.last_action = zeros(6)
         self.joint_target = zeros(6)  # [rad | m]
         self.command = zeros(3)  # what the policy sees: the target command and the heading hold's correction
         self.target_command = zeros(3)
         self.reference_heading = zeros()  # [rad]
         self.reward_names = tuple(self._rewards)
+        self.log_names = (*(f"reward/{name}" for name in self._rewards), *LOG, *(f"fault/{kind}" for kind in KINDS))
         self.reward_terms = torch.zeros(len(self._rewards), self.num_envs, device=self.device)  # of the last step
         self.push_wrench_w = zeros(6)  # on the trunk's centre of mass, world frame [N, N m]
         self._push_timer = zeros()  # time until the next push starts [s]
@@ -98,22 +119,26 @@ class TelebipEnv(VecEnv):
         self._base_lin_vel_b = zeros(3)
         self._energy_share = torch.ones((), device=self.device)
         self._push_share = torch.ones((), device=self.device)
-        self._command_is_fixed = False
-        self._noise = zeros(sum(LAYOUT.values()))  # on the present observation
-        self.num_steps = 0  # since the worlds were made
+        self._command_is_fixed = torch.zeros((), dtype=torch.bool, device=self.device)
+        self._noise = self._draws["noise"]  # on the present observation
+        self.num_steps = torch.zeros((), dtype=torch.long, device=self.device)  # since the worlds were made
         self._fault_recorder = FaultRecorder(self.num_envs, self.device)
         self._memory_before = {name: memory.clone() for name, memory in self.sim.memory.items()}
+        self._before_physics, self._after_physics = self._prepare_step, self._finish_step
+        self._is_recorded = self.device.type == "cuda" and cfg.sim.cuda_graph
+        if self._is_recorded:
+            self._before_physics = CudaGraph(self._prepare_step, self.device, self.generator)
+            self._after_physics = CudaGraph(self._finish_step, self.device, self.generator)
 
         self.reset()
 
     def reset(self) -> TensorDict:
         """Start a new episode in every world and return its observation."""
-        draws = self._draws.draw(self.num_envs, self.generator)
-        self._reset(torch.ones(self.num_envs, dtype=torch.bool, device=self.device), draws)
+        self._draws.draw(self.generator)
+        self._reset(torch.ones(self.num_envs, dtype=torch.bool, device=self.device))
         state = self.sim.state
         self._base_lin_vel_b.copy_(rotate_inverse(state.base_quat, state.base_lin_vel_w))
-        self._update_commands(draws)
-        self._noise.copy_(draws["noise"])
+        self._update_commands()
         return self.get_observations()
 
     def set_command(self, lin_vel_x: float, lin_vel_y: float, ang_vel_z: float) -> None:
@@ -122,7 +147,7 @@ class TelebipEnv(VecEnv):
 
     def set_commands(self, commands: Tensor) -> None:
         """Give each world its row of `commands` (num_envs, 3) [m/s, m/s, rad/s], for good."""
-        self._command_is_fixed = True
+        self._command_is_fixed.fill_(True)
         self.target_command.copy_(commands)
         self._hold_heading()
 
@@ -146,19 +171,33 @@ class TelebipEnv(VecEnv):
         """
         if actions.shape != (self.num_envs, self.num_actions):
             raise ValueError(f"actions must have shape {(self.num_envs, self.num_actions)}, got {tuple(actions.shape)}")
-        cfg = self.cfg
-        # 1. Physics: hold the joint targets for `decimation` steps of the engine.
-        draws = self._draws.draw(self.num_envs, self.generator)
-        self._update_pushes(draws)
-        given, finite = actions, actions.isfinite().all(1)
-        actions = torch.where(finite[:, None], given, 0.0)
-        self.joint_target.copy_(joint_targets(actions, self._nominal, self._action_scale))
+        self._given.copy_(actions)
+        self._before_physics()
+        self.sim.step(self.joint_target, self.push_wrench_w)  # held for `decimation` steps of the engine
+        outcome = self._after_physics()
+        if self._is_recorded:  # the next replay writes to the same memory
+            outcome = Outcome(*(value if value is None else value.clone() for value in outcome))
+        extras: dict[str, Any] = {"time_outs": outcome.time_outs}
+        extras["log"] = dict(zip(self.log_names, outcome.log.unbind(), strict=True))
+        if outcome.final_obs is not None:
+            extras["final_obs"] = self._observed(outcome.final_obs)
+        return self._observed(outcome.obs), outcome.rewards, outcome.dones, extras
+
+    def _prepare_step(self) -> None:
+        """Draw the step's random numbers, and set the joint targets and the push."""
+        self._draws.draw(self.generator)
+        self._update_pushes()
+        self._finite.copy_(self._given.isfinite().all(1))
+        self._action.copy_(self._given).masked_fill_(~self._finite[:, None], 0.0)
+        self.joint_target.copy_(joint_targets(self._action, self._nominal, self._action_scale))
         for name, memory in self.sim.memory.items():
             self._memory_before[name].copy_(memory)
-        state = self.sim.step(self.joint_target, self.push_wrench_w)
-        self.num_steps += 1
 
-        # 2. Clocks and derived quantities at the new time.
+    def _finish_step(self) -> Outcome:
+        """Judge what the physics has brought about, reset the worlds that have ended, and observe."""
+        cfg, state = self.cfg, self.sim.state
+        # 1. Clocks and derived quantities at the new time.
+        self.num_steps += 1
         self.episode_length_buf += 1
         self._command_timer -= self.step_dt
         self.reference_heading.copy_(wrap_angle(self.reference_heading + self.step_dt * self.target_command[:, 2]))
@@ -166,21 +205,21 @@ class TelebipEnv(VecEnv):
         sample = gait.foot_sample(self.phase, state.foot_force, self.robot.weight, cfg.reward.foot.cap)
         self._foot_window.copy_(gait.push_sample(self._foot_window, sample))
 
-        # 3. Terminations. A world with a fault ends its episode like a fall, and is counted by the kind of fault.
-        faults = torch.cat([torch.stack([~finite, terminations.non_finite(state)]), self.sim.faults])
-        cause = {**self._memory_before, **self.sim.model_fields, "action": given, "push_wrench_w": self.push_wrench_w}
+        # 2. Terminations. A world with a fault ends its episode like a fall, and is counted by the kind of fault.
+        faults = torch.cat([torch.stack([~self._finite, terminations.non_finite(state)]), self.sim.faults])
+        cause = {**self._memory_before, **self.sim.model_fields, "action": self._given, "push_wrench_w": self.push_wrench_w}
         self._fault_recorder.note(faults, cause, self.num_steps)
         fault = faults.any(0)
         terminated = terminations.fallen(state, cfg.episode.min_hip_height) | fault
         time_outs = terminations.timed_out(self.episode_length_buf, self.max_episode_length) & ~terminated
         dones = terminated | time_outs
 
-        # 4. Rewards. What a fault has made non-finite counts as zero, in its own world alone.
+        # 3. Rewards. What a fault has made non-finite counts as zero, in its own world alone.
         context = StepContext(
             state=state,
             base_lin_vel_b=self._base_lin_vel_b,
             command=self.command,
-            action=actions,
+            action=self._action,
             last_action=self.last_action,
             force_limit=self._force_limit,
             weight=self.robot.weight,
@@ -189,40 +228,43 @@ class TelebipEnv(VecEnv):
             energy_share=self._energy_share,
             fallen=terminated,
         )
-        terms = torch.stack([term(context) for term in self._rewards.values()])
-        terms = torch.where(fault & ~torch.isfinite(terms), 0.0, terms)
-        self.reward_terms.copy_(terms)
-        rewards = terms.sum(0)
+        self.reward_terms.copy_(torch.stack([term(context) for term in self._rewards.values()]))
+        terms = self.reward_terms.masked_fill_(fault & ~self.reward_terms.isfinite(), 0.0)
         log = self._log(context, terms, faults)
-        self.last_action.copy_(actions)
+        self.last_action.copy_(self._action)
 
-        # 5. Reset finished worlds, draw new commands where they are due, observe.
-        extras = {"time_outs": time_outs, "log": log}
-        self._noise.copy_(draws["noise"])
+        # 4. Reset finished worlds, give new commands where they are due, observe.
+        final_obs = None
         if self._keep_final_obs:
             self._hold_heading()
-            extras["final_obs"] = self.get_observations()
-        self._reset(dones, draws)
+            final_obs = self._observe()
+        self._reset(dones)
         self._base_lin_vel_b.copy_(rotate_inverse(state.base_quat, state.base_lin_vel_w))
-        self._update_commands(draws)
-        obs = self.get_observations()
-        if self._keep_final_obs:
-            extras["final_obs"]["policy"] = torch.where(fault[:, None], obs["policy"], extras["final_obs"]["policy"])
-        return obs, rewards, dones, extras
+        self._update_commands()
+        obs = self._observe()
+        if final_obs is not None:
+            final_obs = torch.where(fault[:, None], obs, final_obs)
+        return Outcome(obs, terms.sum(0), dones, time_outs, log, final_obs)
 
     def get_observations(self) -> TensorDict:
         """Return a new {"policy": (num_envs, 33)} of the present state and its noise; see `mdp.observations.LAYOUT`."""
+        return self._observed(self._observe())
+
+    def _observe(self) -> Tensor:
         state = self.sim.state
         quat = heading_relative_quat(state.base_quat, self.reference_heading)
         obs = observation(state, self._nominal, self.last_action, self._base_lin_vel_b, quat, self.command, self.phase)
         if self.cfg.disturbance.noise.enabled:
             obs += self._noise
+        return obs
+
+    def _observed(self, obs: Tensor) -> TensorDict:
         return TensorDict({"policy": obs}, batch_size=[self.num_envs], device=self.device)
 
     def state_dict(self) -> dict[str, Any]:
         """Return a copy of all that the worlds' future depends on; `load_state_dict` goes on from it, bit for bit."""
         copies = {part: {name: value.clone() for name, value in values.items()} for part, values in self._live.items()}
-        return {**copies, "generator": self.generator.get_state(), "num_steps": self.num_steps}
+        return {**copies, "generator": self.generator.get_state()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on from another environment's `state_dict`.
@@ -241,7 +283,6 @@ class TelebipEnv(VecEnv):
             for name, value in live[part].items():
                 value.copy_(state[part][name])
         self.generator.set_state(state["generator"].cpu())
-        self.num_steps = state["num_steps"]
 
     @property
     def _live(self) -> dict[str, dict[str, Tensor]]:
@@ -257,8 +298,9 @@ class TelebipEnv(VecEnv):
         """Phase signals (p_r, p_l) at the present time, (num_envs, 2)."""
         return gait.phase_signals(self.episode_length_buf * self.step_dt, self.cfg.gait.period)
 
-    def _reset(self, mask: Tensor, draws: dict[str, Tensor]) -> None:
+    def _reset(self, mask: Tensor) -> None:
         """Start a new episode in the worlds where `mask` (num_envs,) holds."""
+        draws = self._draws
         heading = draws["heading"]
         self.sim.reset(mask, initial_qpos(self._home_qpos, draws["joint_offset"], heading), draws["qvel"])
         if self.cfg.disturbance.friction.enabled:
@@ -270,27 +312,25 @@ class TelebipEnv(VecEnv):
         for buffer in (self.last_action, self._foot_window, self.push_wrench_w):
             buffer.masked_fill_(mask[:, None], 0.0)
 
-    def _update_pushes(self, draws: dict[str, Tensor]) -> None:
+    def _update_pushes(self) -> None:
         """Start a push where its time has come and end it after its duration. The timer counts down to the next start."""
         cfg = self.cfg.disturbance.push
         if not cfg.enabled:
             return
-        force = self._push_share * push_force(draws["push"])
+        force = self._push_share * push_force(self._draws["push"])
         start = self._push_timer <= 0.0
-        torch.where(start, draws["push_interval"][:, 0], self._push_timer, out=self._push_timer)
+        torch.where(start, self._draws["push_interval"][:, 0], self._push_timer, out=self._push_timer)
         self._push_timer -= self.step_dt
         self._push_time_left -= self.step_dt
         self._push_time_left.masked_fill_(start, cfg.duration)
         kept = torch.where(start[:, None], force, self.push_wrench_w[:, :2])
         self.push_wrench_w[:, :2] = kept.masked_fill(self._push_time_left[:, None] < 0.5 * self.step_dt, 0.0)
 
-    def _update_commands(self, draws: dict[str, Tensor]) -> None:
+    def _update_commands(self) -> None:
         """Give a new command where the last one has expired, and bring the heading hold up to date."""
-        cfg = self.cfg.command
-        if not self._command_is_fixed:
-            due = self._command_timer < 0.5 * self.step_dt
-            torch.where(due[:, None], draws["command"], self.target_command, out=self.target_command)
-            self._command_timer.masked_fill_(due, cfg.resampling_time)
+        due = (self._command_timer < 0.5 * self.step_dt) & ~self._command_is_fixed
+        torch.where(due[:, None], self._draws["command"], self.target_command, out=self.target_command)
+        self._command_timer.masked_fill_(due, self.cfg.command.resampling_time)
         self._hold_heading()
 
     def _hold_heading(self) -> None:
@@ -299,8 +339,8 @@ class TelebipEnv(VecEnv):
         gain, limit = self.cfg.command.heading_gain, self.cfg.command.heading_limit
         self.command.copy_(hold_heading(self.target_command, heading, self.reference_heading, gain, limit))
 
-    def _log(self, context: StepContext, terms: Tensor, faults: Tensor) -> dict[str, Tensor]:
-        """Means over the worlds, as scalars on the device; faulty worlds are left out of all but their own count."""
+    def _log(self, context: StepContext, terms: Tensor, faults: Tensor) -> Tensor:
+        """Return what `log_names` names; faulty worlds are left out of all but their own numbers."""
         state, fault = context.state, faults.any(0)
         error = context.command - torch.cat([context.base_lin_vel_b[:, :2], state.base_ang_vel_b[:, 2:]], dim=1)
         rows = torch.stack(
@@ -313,13 +353,8 @@ class TelebipEnv(VecEnv):
                 context.fallen.float(),
             ]
         )
-        *rewards, lin_vel_error, yaw_rate_error, power, speed, falls = rows.masked_fill(fault, 0.0).sum(1) / (~fault).sum()
-        return {
-            **{f"reward/{name}": value for name, value in zip(self._rewards, rewards, strict=True)},
-            "error/lin_vel_mps": lin_vel_error,
-            "error/yaw_rate_radps": yaw_rate_error,
-            "walk/cost_of_transport": power / (self.robot.weight * speed),
-            "walk/falls_per_minute": falls * (60.0 / self.step_dt),
-            "fault/worlds": fault.sum(),
-            **{f"fault/{kind}": number for kind, number in zip(KINDS, faults.sum(1), strict=True)},
-        }
+        means = rows.masked_fill(fault, 0.0).sum(1) / (~fault).sum()
+        power, speed, falls = means[-3:]
+        cost_of_transport = power / (self.robot.weight * speed)
+        falls_per_minute = falls * (60.0 / self.step_dt)
+        return torch.cat([means[:-3], torch.stack([cost_of_transport, falls_per_minute, fault.sum()]), faults.sum(1)])

@@ -159,7 +159,7 @@ def test_a_healthy_step_replays_bit_for_bit(make_env: MakeEnv, tmp_path: Path) -
         env.step(action)
     seen = {}
 
-    def step_without_reset(mask: Tensor, draws: dict[str, Tensor]) -> None:
+    def step_without_reset(mask: Tensor) -> None:
         seen["qpos"] = env.sim.state.qpos[BAD].clone()
 
     env._reset = step_without_reset  # type: ignore[method-assign]

@@ -23,22 +23,22 @@ class FaultRecorder:
         """Start with nothing seen."""
         self._seen = torch.zeros(len(KINDS), dtype=torch.bool, device=device)
         self._world = torch.arange(num_envs, device=device)
+        self._may_ask = device.type == "cpu"  # where it costs nothing
         self._records: dict[str, Tensor] = {}
         self._taken: set[str] = set()
 
-    def note(self, faults: Tensor, world: Mapping[str, Tensor], step: int) -> None:
+    def note(self, faults: Tensor, world: Mapping[str, Tensor], step: Tensor) -> None:
         """Keep the first faulty world of each kind that has none yet; masks and gathers of fixed shape.
 
         Args:
             faults: bool, (kinds, num_envs).
             world: what to keep, (num_envs, ...) each: all that the step's outcome depended on.
-            step: number of this step.
+            step: number of this step, ().
         """
-        if faults.is_cpu and not faults.numpy().any():
-            return  # on a CPU, asking costs nothing
+        if self._may_ask and not faults.numpy().any():
+            return
         first, new = faults.byte().argmax(1), faults.any(1) & ~self._seen
-        steps = torch.full_like(self._world, step)
-        for name, value in {"step": steps, "world": self._world, **world}.items():
+        for name, value in {"step": step.expand_as(self._world), "world": self._world, **world}.items():
             rows = value.index_select(0, first)
             kept = self._records.setdefault(name, torch.zeros_like(rows))
             kept.copy_(torch.where(new.view(-1, *[1] * (rows.dim() - 1)), rows, kept))

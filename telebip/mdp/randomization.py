@@ -39,23 +39,27 @@ def ranges(cfg: TaskConfig) -> Ranges:
 
 
 class Draws:
-    """Draws numbers, uniform in their ranges, for all worlds at once.
+    """Numbers, uniform in their ranges, for all worlds: `draws[name]` is (num_envs, size), and `draw` writes new ones to it.
 
     Every world gets its own numbers at every step, needed or not, so that shapes are static and what happens to one world
     changes nothing for the others.
     """
 
-    def __init__(self, ranges: Ranges, device: torch.device) -> None:
-        """Put the bounds of `ranges` on `device`."""
-        self._sizes = {name: len(bounds) for name, bounds in ranges.items()}
+    def __init__(self, ranges: Ranges, num_envs: int, device: torch.device) -> None:
+        """Allocate them on `device`."""
         self._low, high = torch.tensor([bound for bounds in ranges.values() for bound in bounds], device=device).unbind(1)
         self._span = high - self._low
+        self._values = torch.zeros(num_envs, len(high), device=device)
+        parts = self._values.split([len(bounds) for bounds in ranges.values()], dim=1)
+        self._parts = dict(zip(ranges, parts, strict=True))
 
-    def draw(self, num_envs: int, generator: torch.Generator) -> dict[str, Tensor]:
-        """Return name -> (num_envs, size) for every range."""
-        unit = torch.rand(num_envs, len(self._span), generator=generator, device=generator.device)
-        parts = torch.addcmul(self._low, self._span, unit).split(list(self._sizes.values()), dim=1)
-        return dict(zip(self._sizes, parts, strict=True))
+    def draw(self, generator: torch.Generator) -> None:
+        """Draw all anew."""
+        torch.addcmul(self._low, self._span, self._values.uniform_(generator=generator), out=self._values)
+
+    def __getitem__(self, name: str) -> Tensor:
+        """Return the present numbers of a range, (num_envs, size)."""
+        return self._parts[name]
 
 
 def uniform(shape: tuple[int, ...], low: float, high: float, generator: torch.Generator) -> Tensor:

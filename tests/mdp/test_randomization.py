@@ -24,7 +24,9 @@ EPISODE = EpisodeConfig(
 
 
 def draws(cfg: TaskConfig, seed: int = 0, num_envs: int = 2048) -> dict[str, Tensor]:
-    return Draws(ranges(cfg), torch.device("cpu")).draw(num_envs, torch.Generator().manual_seed(seed))
+    draws = Draws(ranges(cfg), num_envs, torch.device("cpu"))
+    draws.draw(torch.Generator().manual_seed(seed))
+    return {name: draws[name] for name in ranges(cfg)}
 
 
 def draw(episode: EpisodeConfig = EPISODE, seed: int = 0, num_envs: int = 2048) -> tuple[Tensor, Tensor]:

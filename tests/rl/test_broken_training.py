@@ -44,7 +44,7 @@ class Training:
         step = self.env.step
 
         def stepped(actions: Tensor):
-            before_step(self.env.num_steps)
+            before_step(int(self.env.num_steps))
             return step(actions)
 
         self.env.step = stepped  # type: ignore[method-assign]

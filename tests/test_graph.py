@@ -1,0 +1,153 @@
+"""What `env.step` records as CUDA graphs can be recorded: one step's operators, replayed without Python, make all others."""
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from telebip.config import load_task
+from telebip.env import TelebipEnv
+from telebip.graph import CudaGraph
+from telebip.robot import Robot
+from tests.worlds import put_low, random_actions
+
+EVENTFUL = (
+    *("episode.length=0.3", "command.resampling_time=0.1", "disturbance.push.interval=[0.06,0.2]"),
+    *("disturbance.push.force=150.0", "reward.energy.k_energy=-0.3", "ppo.max_fault_rate=1.0"),
+)
+
+
+class Recording(TorchDispatchMode):
+    """What a CUDA graph is, for tensors on a CPU: operators with the memory that they read and write, and nothing else."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.has_run = True  # on a CPU, recording runs what it records
+        self.calls: list[tuple[Any, Any, Any, Any]] = []
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        self.calls.append((func, args, kwargs or {}, result))
+        return result
+
+    def replay(self) -> None:
+        """Run the operators again, each on the memory it had."""
+        if self.has_run:
+            self.has_run = False
+            return
+        for func, args, kwargs, result in self.calls:
+            again = func(*args, **kwargs)
+            for old, new in zip(_tensors(result), _tensors(again), strict=True):
+                if old.data_ptr() != new.data_ptr():  # neither a view nor written in place
+                    old.copy_(new)
+
+
+def _tensors(value: Any) -> list[Tensor]:
+    values = value if isinstance(value, (tuple, list)) else [value]
+    return [x for x in values if isinstance(x, Tensor)]
+
+
+class ReplayedOnCpu(CudaGraph):
+    """A `CudaGraph` of operators instead of kernels."""
+
+    def _record(self) -> Any:
+        with Recording() as recording:
+            result = self._function()
+        return recording, result
+
+
+def replayed(env: TelebipEnv) -> TelebipEnv:
+    """Let `env` record and replay its steps, as on CUDA."""
+    env._is_recorded = True
+    env._fault_recorder._may_ask = False
+    env._before_physics, env._after_physics = (
+        ReplayedOnCpu(function, env.device, env.generator) for function in (env._prepare_step, env._finish_step)
+    )
+    return env
+
+
+@pytest.mark.parametrize("keep_final_obs", [False, True])
+def test_a_recorded_step_makes_every_later_step(robot: Robot, keep_final_obs: bool) -> None:
+    config = load_task("telebip_flat", ["num_envs=6", *EVENTFUL])
+    plain, env = (TelebipEnv(config, robot, "cpu", "warp", keep_final_obs) for _ in range(2))
+    env = replayed(env)
+    seen = {"fallen": 0, "timed out": 0, "faults": 0}
+    for number, action in enumerate(random_actions(60, 6, 0.7)):
+        if number == 20:
+            action[2] = torch.nan
+        if number == 30:
+            for each in (plain, env):
+                put_low(each, [1])
+        if number == 40:
+            for each in (plain, env):
+                each.set_command(0.6, 0.0, 0.1)
+                each.set_progress(3e6)
+        (obs, rewards, dones, extras), (obs_2, rewards_2, dones_2, extras_2) = plain.step(action), env.step(action)
+        assert torch.equal(obs["policy"], obs_2["policy"])
+        assert torch.equal(rewards, rewards_2)
+        assert torch.equal(dones, dones_2)
+        assert torch.equal(extras["time_outs"], extras_2["time_outs"])
+        assert extras["log"] == extras_2["log"]
+        if keep_final_obs:
+            assert torch.equal(extras["final_obs"]["policy"], extras_2["final_obs"]["policy"])
+        seen["fallen"] += int((dones & ~extras["time_outs"]).sum())
+        seen["timed out"] += int(extras["time_outs"].sum())
+        seen["faults"] += int(extras["log"]["fault/worlds"])
+    assert min(seen.values()) > 0
+    fault, fault_2 = plain.take_faults()["non_finite_action"], env.take_faults()["non_finite_action"]
+    assert int(fault["step"]) == int(fault_2["step"]) == 21
+    assert int(fault["world"]) == int(fault_2["world"]) == 2
+
+
+def test_a_recorded_step_goes_on_from_a_state(robot: Robot) -> None:
+    config = load_task("telebip_flat", ["num_envs=3", *EVENTFUL])
+    first, second = (replayed(TelebipEnv(config, robot, "cpu", "warp")) for _ in range(2))
+    actions = random_actions(12, 3)
+    for action in actions[:8]:
+        first.step(action)
+    second.step(actions[0])
+    second.step(actions[0])
+    second.load_state_dict(first.state_dict())
+    for action in actions[8:]:
+        assert torch.equal(first.step(action)[0]["policy"], second.step(action)[0]["policy"])
+
+
+def test_what_a_recorded_step_returned_is_not_written_to_again(robot: Robot) -> None:
+    env = replayed(TelebipEnv(load_task("telebip_flat", ["num_envs=3"]), robot, "cpu", "warp"))
+    env.step(torch.zeros(3, 6))
+    obs, rewards, _, extras = env.step(torch.zeros(3, 6))
+    kept = obs["policy"].clone(), rewards.clone(), {name: value.clone() for name, value in extras["log"].items()}
+    env.step(torch.ones(3, 6))
+    assert torch.equal(obs["policy"], kept[0])
+    assert torch.equal(rewards, kept[1])
+    assert extras["log"] == kept[2]
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_on_cuda_the_graphs_do_what_the_functions_do(robot: Robot) -> None:
+    """Sums in another order round differently, and contacts let that grow; within 15 steps it stays below 1e-3."""
+    plain, env = (
+        TelebipEnv(load_task("telebip_flat", ["num_envs=64", *EVENTFUL, f"sim.cuda_graph={graph}"]), robot, "cuda", "warp")
+        for graph in ("false", "true")
+    )
+    for action in random_actions(15, 64, 0.3).cuda():
+        (obs, rewards, dones, extras), (obs_2, rewards_2, dones_2, extras_2) = plain.step(action), env.step(action)
+        torch.testing.assert_close(obs["policy"], obs_2["policy"], atol=1e-3, rtol=0.0)
+        torch.testing.assert_close(rewards, rewards_2, atol=1e-3, rtol=0.0)
+        assert torch.equal(dones, dones_2)
+        assert extras["log"].keys() == extras_2["log"].keys()
+    assert int(env.num_steps) == 15
+    assert torch.equal(plain.generator.get_state(), env.generator.get_state())
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_a_reward_that_reads_back_is_refused_with_what_to_do(robot: Robot) -> None:
+    env = TelebipEnv(load_task("telebip_flat", ["num_envs=4"]), robot, "cuda", "warp")
+    env._rewards["cmd"] = lambda context: context.action.sum(1) * context.action.sum().item()
+    env.step(torch.zeros(4, 6, device="cuda"))
+    with pytest.raises(RuntimeError, match=r"sim\.cuda_graph=false"):
+        env.step(torch.zeros(4, 6, device="cuda"))
