@@ -123,7 +123,6 @@ class TelebipEnv(VecEnv):
         self._noise = self._draws["noise"]  # on the present observation
         self.num_steps = torch.zeros((), dtype=torch.long, device=self.device)  # since the worlds were made
         self._fault_recorder = FaultRecorder(self.num_envs, self.device)
-        self._memory_before = {name: memory.clone() for name, memory in self.sim.memory.items()}
         self._before_physics, self._after_physics = self._prepare_step, self._finish_step
         self._is_recorded = self.device.type == "cuda" and cfg.sim.cuda_graph
         if self._is_recorded:
@@ -190,8 +189,6 @@ class TelebipEnv(VecEnv):
         self._finite.copy_(self._given.isfinite().all(1))
         self._action.copy_(self._given).masked_fill_(~self._finite[:, None], 0.0)
         self.joint_target.copy_(joint_targets(self._action, self._nominal, self._action_scale))
-        for name, memory in self.sim.memory.items():
-            self._memory_before[name].copy_(memory)
 
     def _finish_step(self) -> Outcome:
         """Judge what the physics has brought about, reset the worlds that have ended, and observe."""
@@ -207,7 +204,7 @@ class TelebipEnv(VecEnv):
 
         # 2. Terminations. A world with a fault ends its episode like a fall, and is counted by the kind of fault.
         faults = torch.cat([torch.stack([~self._finite, terminations.non_finite(state)]), self.sim.faults])
-        cause = {**self._memory_before, **self.sim.model_fields, "action": self._given, "push_wrench_w": self.push_wrench_w}
+        cause = {**self.sim.memory_before, **self.sim.model_fields, "action": self._given, "push_wrench_w": self.push_wrench_w}
         self._fault_recorder.note(faults, cause, self.num_steps)
         fault = faults.any(0)
         terminated = terminations.fallen(state, cfg.episode.min_hip_height) | fault

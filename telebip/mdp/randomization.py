@@ -81,7 +81,7 @@ def initial_qpos(home_qpos: Tensor, joint_offset: Tensor, heading: Tensor) -> Te
     Returns:
         qpos (num_envs, 13), as in `SimState`.
     """
-    lift = -joint_offset[:, KNEES].amin(dim=1, keepdim=True).clamp(max=0.0)
+    lift = -torch.minimum(*joint_offset[:, KNEES].split(1, dim=1)).clamp(max=0.0)
     x_y = home_qpos[:2].expand(len(lift), -1)
     return torch.cat([x_y, home_qpos[2] + lift, quat_from_yaw(heading[:, 0]), home_qpos[7:] + joint_offset], dim=1)
 

@@ -87,6 +87,8 @@ class Simulator(Protocol):
     """What the engine says about a kind of `faults`: which setting to change, or its message."""
     memory: dict[str, Tensor]
     """Live tensors, in the engine's own precision, of all else that the outcome of a `step` depends on."""
+    memory_before: dict[str, Tensor]
+    """Copies of `memory` from before the last `step`."""
 
     def step(self, targets: Tensor, wrench_w: Tensor) -> SimState:
         """Hold joint `targets` (num_envs, 6) [rad | m] and the trunk wrench for one policy step, and return `state`.

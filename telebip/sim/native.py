@@ -49,8 +49,13 @@ class NativeSimulator:
         # A non-finite state stays, to be seen and counted by the environment; the engine would silently reset it.
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self._batch = Batch(model, num_envs, num_threads)
-        self.memory = {name: torch.from_numpy(self._batch.bind(name)) for name in ("qpos", "qvel", "qacc_warmstart", "time")}
-        self._qpos, self._qvel, self._warmstart, self._time = self.memory.values()
+        self.memory = {name: torch.from_numpy(self._batch.bind(name)) for name in ("time", "qpos", "qvel", "qacc_warmstart")}
+        self._time, self._qpos, self._qvel, self._warmstart = self.memory.values()
+        sizes = (1, model.nq, model.nv, model.nv)
+        self._memory = torch.from_numpy(self._batch.state)[:, : sum(sizes)]  # the same, in one piece: copied at once
+        self._memory_before = self._memory.clone()
+        self.memory_before = dict(zip(self.memory, self._memory_before.split(sizes, dim=1), strict=True))
+        self.memory_before["time"] = self.memory_before["time"][:, 0]
         self._ctrl = torch.from_numpy(self._batch.bind("ctrl"))
         self.advice = {"capacity": 'raise <size memory="..."/> in the MJCF'}
         self._faults = np.zeros((len(ENGINE_FAULTS), num_envs), dtype=bool)
@@ -67,6 +72,7 @@ class NativeSimulator:
     def step(self, targets: Tensor, wrench_w: Tensor) -> SimState:
         """See `Simulator.step`."""
         self.write(targets, wrench_w)
+        self._memory_before.copy_(self._memory)
         with _silence(), contextlib.suppress(SimulationError):  # those worlds keep the state that they had
             self._batch.rollout(self._decimation, record=tuple(self._record), out=self._record)
         self._read_faults()

@@ -101,20 +101,23 @@ class WarpSimulator:
             wp.to_torch(a) for a in (self._data.ctrl, self._data.qacc_warmstart, self._data.time)
         )
         self.memory = {"qpos": state.qpos, "qvel": state.qvel, "qacc_warmstart": self._warmstart, "time": self._time}
+        self._live = [self._data.qpos, self._data.qvel, self._data.qacc_warmstart, self._data.time]
+        self._copies = [wp.clone(array) for array in self._live]
+        self.memory_before = {name: wp.to_torch(copy) for name, copy in zip(self.memory, self._copies, strict=True)}
         self._trunk_wrench = wp.to_torch(self._data.xfrc_applied)[:, robot.trunk_id]
         self.advice = {
             "capacity": f"raise sim.max_contacts ({max_contacts}) or sim.max_constraints ({max_constraints}), both per world"
         }
         self._overflow = wp.to_torch(self._data.overflow)
         self.faults = torch.zeros(len(ENGINE_FAULTS), num_envs, dtype=torch.bool, device=device)  # warns of nothing else
-        self._graphs = {True: self._capture(with_means=True)} if self._wp_device.is_cuda else {}
+        self._graphs = {True: self._capture(complete=True)} if self._wp_device.is_cuda else {}
         home = torch.as_tensor(robot.home_qpos, dtype=torch.float32, device=device).expand(num_envs, -1)
         self.reset(torch.ones(num_envs, dtype=torch.bool, device=device), home, torch.zeros(num_envs, 12, device=device))
 
     def step(self, targets: Tensor, wrench_w: Tensor) -> SimState:
         """See `Simulator.step`."""
         self.write(targets, wrench_w)
-        self._run(with_means=True)
+        self._run(complete=True)
         torch.bitwise_and(self._overflow, CAPACITY, out=self._overflow)
         torch.ne(self._overflow, 0, out=self.faults[ENGINE_FAULTS.index("capacity")])
         self._overflow.zero_()
@@ -127,7 +130,7 @@ class WarpSimulator:
 
     def advance(self) -> None:
         """See `Simulator.advance`; on CUDA the first call records a graph, and leaves the worlds some steps further on."""
-        self._run(with_means=False)
+        self._run(complete=False)
         self._overflow.zero_()
 
     def reset(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
@@ -145,24 +148,27 @@ class WarpSimulator:
         for mean in self.state.step_means:
             mean.zero_()
 
-    def _run(self, with_means: bool) -> None:
+    def _run(self, complete: bool) -> None:
         """Run the physics steps of one policy step: on CUDA as a graph, recorded at its first use."""
         if not self._wp_device.is_cuda:
-            self._launch(with_means)
+            self._launch(complete)
             return
-        if with_means not in self._graphs:
-            self._graphs[with_means] = self._capture(with_means)
+        if complete not in self._graphs:
+            self._graphs[complete] = self._capture(complete)
         # On torch's stream, so that torch's work before and after is ordered with it without a synchronisation.
-        wp.capture_launch(self._graphs[with_means], stream=wp.stream_from_torch(torch.cuda.current_stream(self.device)))
+        wp.capture_launch(self._graphs[complete], stream=wp.stream_from_torch(torch.cuda.current_stream(self.device)))
 
-    def _launch(self, with_means: bool) -> None:
-        """Run the physics steps of one policy step, and the means over them if asked."""
+    def _launch(self, complete: bool) -> None:
+        """Run the physics steps of one policy step, and if `complete` all else of `step`: `memory_before` and the means."""
         with wp.ScopedDevice(self._wp_device):
-            for mean in self._means if with_means else ():
-                mean.zero_()
+            if complete:
+                for copy, live in zip(self._copies, self._live, strict=True):
+                    wp.copy(copy, live)
+                for mean in self._means:
+                    mean.zero_()
             for _ in range(self._decimation):
                 mjw.step(self._model, self._data)
-                if not with_means:
+                if not complete:
                     continue
                 wp.launch(
                     _accumulate,
@@ -177,11 +183,11 @@ class WarpSimulator:
                     outputs=self._means,
                 )
 
-    def _capture(self, with_means: bool) -> wp.Graph:
+    def _capture(self, complete: bool) -> wp.Graph:
         """Compile and warm up, then record `_launch` as a CUDA graph."""
         wp.synchronize_device(self._wp_device)
-        self._launch(with_means)
+        self._launch(complete)
         with wp.ScopedCapture(device=self._wp_device) as capture:
-            self._launch(with_means)
+            self._launch(complete)
         wp.synchronize_device(self._wp_device)  # from here on everything runs on torch's stream
         return capture.graph  # type: ignore[return-value]

@@ -152,6 +152,18 @@ def test_worlds_start_at_home_and_at_rest(make: Make, robot: Robot) -> None:
     assert not any(state[name].any() for name in FIELDS if name != "qpos")
 
 
+def test_the_memory_from_before_a_step_makes_the_step_again(make: Make, robot: Robot) -> None:
+    sim = make()
+    targets, wrenches = (values.to(sim.device) for values in random_inputs(robot, NUM_ENVS, 4))
+    for target, wrench in zip(targets, wrenches, strict=True):
+        live = {name: value.clone() for name, value in sim.memory.items()}
+        after = snapshot(sim.step(target, wrench))
+        assert sim.memory_before.keys() == live.keys()
+        assert all(torch.equal(sim.memory_before[name], value) for name, value in live.items())
+    sim.load({name: value.clone() for name, value in sim.memory_before.items()})
+    assert_conform(snapshot(sim.step(targets[-1], wrenches[-1])), after, exact=sim.device.type == "cpu")
+
+
 def test_reset_changes_masked_worlds_only(make: Make, robot: Robot) -> None:
     sim = make()
     run(sim, *random_inputs(robot, NUM_ENVS, 3))
