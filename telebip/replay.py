@@ -1,6 +1,5 @@
 """Faults on disk, and how to repeat them: the state of one world before the step that broke it, and all that acted on it."""
 
-import io
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -9,11 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from telebip.archive import load_archive, save_archive
 from telebip.config import TaskConfig, parse_config, to_yaml
 from telebip.env import MODEL_FIELDS, TelebipEnv
 from telebip.errors import UserError
 from telebip.eval.rollout import Rollout
-from telebip.files import write_atomically
 from telebip.mdp.actions import action_scale, joint_targets
 from telebip.mdp.faults import KINDS
 from telebip.mdp.terminations import non_finite
@@ -88,9 +87,7 @@ def save_fault(run_dir: Path, kind: str, record: dict[str, Tensor], task: str, e
         "seed": env.cfg.seed,
         "backend": env.sim.backend,
     }
-    archive = io.BytesIO()
-    torch.save({**about, "record": record}, archive)
-    write_atomically(file, archive.getvalue())
+    save_archive(file, {**about, "record": record})
     return file
 
 
@@ -100,14 +97,9 @@ def load_fault(path: str | Path) -> Fault:
     Raises:
         UserError: there is no such file, or it is something else.
     """
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except OSError as error:
-        raise UserError(f"fault '{path}' cannot be read: {error.strerror or error}") from error
-    except Exception as error:  # as many as there are bytes
-        raise UserError(f"'{path}' is not a fault that telebip has dumped, or is damaged") from error
-    if not isinstance(content, dict) or content.get("format") != FORMAT or content.get("kind") not in KINDS:
-        raise UserError(f"'{path}' is not a fault that telebip has dumped ({FORMAT})")
+    content = load_archive(Path(path), "fault", FORMAT)
+    if content.get("kind") not in KINDS:
+        raise UserError(f"fault '{path}': this version knows no '{content.get('kind')}'")
     return Fault(content["kind"], parse_config(content["config"], f"{path}:config"), content["backend"], content["record"])
 
 

@@ -10,7 +10,7 @@ import pytest
 from telebip import ROOT
 
 LAYERS = [
-    {"telebip", "telebip.config", "telebip.errors", "telebip.files", "telebip.math"},
+    {"telebip", "telebip.archive", "telebip.config", "telebip.errors", "telebip.files", "telebip.graph", "telebip.math"},
     {"telebip.robot"},
     {"telebip.sim"},
     {"telebip.mdp"},

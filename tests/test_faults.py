@@ -10,6 +10,7 @@ from torch import Tensor
 from worlds import NEVER_FALL, HostReads, MakeEnv, put, random_actions
 
 from telebip import ROOT
+from telebip.archive import DamagedArchiveError, save_archive
 from telebip.config import load_task
 from telebip.control.policy import Stateless
 from telebip.env import TelebipEnv
@@ -187,14 +188,29 @@ def test_noting_faults_waits_for_nothing(make_env: MakeEnv) -> None:
     assert reads.seen == []
 
 
-@pytest.mark.parametrize("content", [b"", b"not this", None], ids=["empty", "bytes", "checkpoint"])
-def test_what_is_no_fault_is_refused(tmp_path: Path, content: bytes | None) -> None:
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [(b"", "not a telebip fault"), (b"not this", "not a telebip fault"), (None, "has format 'telebip-checkpoint-1'")],
+    ids=["empty", "bytes", "checkpoint"],
+)
+def test_what_is_no_fault_is_refused(tmp_path: Path, content: bytes | None, says: str) -> None:
     path = tmp_path / "fault.pt"
     if content is None:
-        torch.save({"format": "telebip-checkpoint-1"}, path)
+        save_archive(path, {"format": "telebip-checkpoint-1"})
     else:
         path.write_bytes(content)
-    with pytest.raises(UserError, match="is not a fault"):
+    with pytest.raises(UserError, match=says):
         load_fault(path)
     with pytest.raises(UserError, match="cannot be read"):
         load_fault(tmp_path / "nowhere.pt")
+
+
+def test_a_damaged_fault_is_refused(make_env: MakeEnv, tmp_path: Path) -> None:
+    env = make_env(num_envs=NUM_ENVS)
+    env.step(break_action(env, torch.zeros(NUM_ENVS, 6)))
+    path = save_fault(tmp_path, "non_finite_action", env.take_faults()["non_finite_action"], "t", env)
+    content = bytearray(path.read_bytes())
+    content[content.index(env.sim.backend.encode())] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(DamagedArchiveError, match="a checksum is wrong"):
+        load_fault(path)

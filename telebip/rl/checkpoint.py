@@ -1,22 +1,17 @@
-"""Checkpoints: self-contained, written atomically, and data only (`weights_only=True`): loading one never runs code.
+"""Checkpoints: self-contained archives (`telebip.archive`) of data: loading one never runs code.
 
-A checkpoint is a zip archive, as `torch.save` writes it; the CRC-32 of each of its records tells whether it is as written.
 A policy exported to ONNX is read as a checkpoint too: one that can be walked, but not resumed.
 """
 
-import io
 import re
-import zipfile
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from telebip import ROOT
+from telebip.archive import DamagedArchiveError, load_archive, save_archive
 from telebip.config import TaskConfig, parse_config, to_yaml
 from telebip.errors import UserError
-from telebip.files import write_atomically
 from telebip.mdp.observations import LAYOUT
 from telebip.rl.onnx import OnnxPolicy
 from telebip.robot import JOINTS, Robot
@@ -43,10 +38,6 @@ class Checkpoint:
     def is_onnx(self) -> bool:
         """Whether the file holds a policy exported to ONNX."""
         return self.path.suffix == ".onnx"
-
-
-class DamagedCheckpointError(UserError):
-    """A checkpoint's bytes are not those that were written: an older one of the same run will do."""
 
 
 def save_checkpoint(
@@ -76,9 +67,7 @@ def save_checkpoint(
         **learner,
         **({"training": training} if training else {}),
     }
-    archive = io.BytesIO()
-    torch.save(content, archive)
-    write_atomically(path, archive.getvalue())
+    save_archive(path, content)
 
 
 def prune_checkpoints(run_dir: Path, keep: int) -> None:
@@ -101,7 +90,7 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     for file in candidates:
         try:
             return replace(_load_onnx(file) if file.suffix == ".onnx" else _load_file(file), damaged=tuple(damaged))
-        except DamagedCheckpointError as error:
+        except DamagedArchiveError as error:
             if len(candidates) == 1:
                 raise
             damaged.append(str(error))
@@ -109,14 +98,7 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
 
 
 def _load_file(file: Path) -> Checkpoint:
-    try:
-        content = _read(file)
-    except OSError as error:
-        raise UserError(f"checkpoint '{file}' cannot be read: {error.strerror or error}") from error
-    if not isinstance(content, dict) or "format" not in content:
-        raise UserError(f"checkpoint '{file}' is not a telebip checkpoint")
-    if content["format"] != FORMAT:
-        raise UserError(f"checkpoint '{file}' has format '{content['format']}', this version reads '{FORMAT}'")
+    content = load_archive(file, "checkpoint", FORMAT)
     missing = {"task", "config", "observation", "action", "iteration", "samples", "actor_state_dict"} - content.keys()
     if missing:
         raise UserError(f"checkpoint '{file}' is not complete: it lacks {', '.join(sorted(missing))}")
@@ -125,24 +107,6 @@ def _load_file(file: Path) -> Checkpoint:
     config = parse_config(content["config"], f"{file}:config")
     training, robot = content.get("training", []), content.get("robot", {})
     return Checkpoint(file, content["task"], config, content["iteration"], content["samples"], learner, training, robot)
-
-
-def _read(file: Path) -> Any:
-    """Return what the archive holds, if every record's checksum is right and all of it is data."""
-    archive = io.BytesIO(file.read_bytes())
-    try:
-        with zipfile.ZipFile(archive) as records:
-            if records.testzip() is not None:
-                raise DamagedCheckpointError(f"checkpoint '{file}' is damaged: a checksum is wrong")
-    except UserError:
-        raise
-    except Exception as error:  # bytes that are no archive fail in as many ways as there are bytes
-        raise DamagedCheckpointError(f"checkpoint '{file}' is not a telebip checkpoint, or is damaged") from error
-    archive.seek(0)
-    try:
-        return torch.load(archive, map_location="cpu", weights_only=True)
-    except Exception as error:
-        raise UserError(f"checkpoint '{file}' is not a telebip checkpoint: it holds more than data") from error
 
 
 def _load_onnx(file: Path) -> Checkpoint:

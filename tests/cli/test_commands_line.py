@@ -193,4 +193,4 @@ def test_a_dumped_fault_is_repeated_and_recorded(tmp_path: Path) -> None:
     assert "non_finite_state, world 2, environment step 1, on native; repeated on native" in printed
     assert printed.splitlines()[-2] == "reproduced"
     assert (tmp_path / "fault.rrd").stat().st_size > 0
-    assert "is not a fault" in refusal(PLAY, "--replay", "assets/policies/telebip_flat/policy.pt")
+    assert "this version reads 'telebip-fault-1'" in refusal(PLAY, "--replay", "assets/policies/telebip_flat/policy.pt")

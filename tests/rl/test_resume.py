@@ -233,16 +233,16 @@ class FullDisk:
         self.folder = folder
 
     def __call__(self) -> None:
-        from telebip.rl import checkpoint
+        from telebip import archive
 
-        write = checkpoint.write_atomically
+        write = archive.write_atomically
 
         def fill(path: Path, content: bytes) -> None:
             if str(path).startswith(self.folder):
                 Path("/dev/full").write_bytes(content)
             write(path, content)
 
-        checkpoint.write_atomically = fill
+        archive.write_atomically = fill
 
 
 def test_a_full_disk_is_told_and_nothing_is_lost(tmp_path: Path) -> None:
