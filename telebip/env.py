@@ -99,7 +99,7 @@ class TelebipEnv(VecEnv):
         self._foot_weights = constant(gait.window_weights(window, cfg.reward.foot.gamma, cfg.reward.foot.first))
         self._friction = self.sim.model_fields["geom_friction"][:, robot.engine_floor_id, 0]  # live, one per world
 
-        self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)  # policy steps since reset
+        self._episode_length = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)  # policy steps since reset
         self._given = zeros(6)  # the policy's actions as they came
         self._finite = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)  # and whether they are numbers
         self._action = zeros(6)  # A_t, zero where they are not
@@ -195,7 +195,7 @@ class TelebipEnv(VecEnv):
         cfg, state = self.cfg, self.sim.state
         # 1. Clocks and derived quantities at the new time.
         self.num_steps += 1
-        self.episode_length_buf += 1
+        self._episode_length += 1
         self._command_timer -= self.step_dt
         self.reference_heading.copy_(wrap_angle(self.reference_heading + self.step_dt * self.target_command[:, 2]))
         self._base_lin_vel_b.copy_(rotate_inverse(state.base_quat, state.base_lin_vel_w))
@@ -208,7 +208,7 @@ class TelebipEnv(VecEnv):
         self._fault_recorder.note(faults, cause, self.num_steps)
         fault = faults.any(0)
         terminated = terminations.fallen(state, cfg.episode.min_hip_height) | fault
-        time_outs = terminations.timed_out(self.episode_length_buf, self.max_episode_length) & ~terminated
+        time_outs = terminations.timed_out(self._episode_length, self.max_episode_length) & ~terminated
         dones = terminated | time_outs
 
         # 3. Rewards. What a fault has made non-finite counts as zero, in its own world alone.
@@ -291,9 +291,18 @@ class TelebipEnv(VecEnv):
         return self._fault_recorder.take()
 
     @property
+    def episode_length_buf(self) -> Tensor:
+        """Policy steps since the last reset, (num_envs,); rsl-rl assigns other ones, which are copied to the same memory."""
+        return self._episode_length
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, value: Tensor) -> None:
+        self._episode_length.copy_(value)
+
+    @property
     def phase(self) -> Tensor:
         """Phase signals (p_r, p_l) at the present time, (num_envs, 2)."""
-        return gait.phase_signals(self.episode_length_buf * self.step_dt, self.cfg.gait.period)
+        return gait.phase_signals(self._episode_length * self.step_dt, self.cfg.gait.period)
 
     def _reset(self, mask: Tensor) -> None:
         """Start a new episode in the worlds where `mask` (num_envs,) holds."""
@@ -304,7 +313,7 @@ class TelebipEnv(VecEnv):
             torch.where(mask, draws["friction"][:, 0], self._friction, out=self._friction)
         torch.where(mask, draws["push_interval"][:, 0], self._push_timer, out=self._push_timer)
         torch.where(mask, heading[:, 0], self.reference_heading, out=self.reference_heading)
-        for buffer in (self.episode_length_buf, self._command_timer):
+        for buffer in (self._episode_length, self._command_timer):
             buffer.masked_fill_(mask, 0)
         for buffer in (self.last_action, self._foot_window, self.push_wrench_w):
             buffer.masked_fill_(mask[:, None], 0.0)

@@ -35,6 +35,16 @@ def test_it_is_an_rsl_rl_vec_env(make_env: MakeEnv, num_envs: int) -> None:
     assert env.episode_length_buf.tolist() == [2] * num_envs
 
 
+def test_ages_that_are_assigned_go_to_the_same_memory(make_env: MakeEnv) -> None:
+    """As rsl-rl's runner assigns them, to spread the time-outs; a CUDA graph would not see another tensor."""
+    env = make_env(num_envs=3)
+    before = env.episode_length_buf
+    env.episode_length_buf = torch.tensor([1, 2, 3])
+    assert before.tolist() == [1, 2, 3]
+    env.step(torch.zeros(3, 6))
+    assert before.tolist() == [2, 3, 4]
+
+
 @pytest.mark.parametrize("shape", [(4, 5), (3, 6), (6,), (4, 6, 1)])
 def test_actions_of_another_shape_are_refused(make_env: MakeEnv, shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match=r"\(4, 6\)"):
