@@ -117,9 +117,10 @@ class Trainer:
             env.set_progress(self.samples)
             learner.get_policy().distribution.std_range[0] = min_std(cfg, self.samples)  # type: ignore[union-attr]
             with torch.inference_mode():
-                obs, logs = self.collect(obs)
+                obs, log_sums = self.collect(obs)
+                sums = dict(zip(env.log_names, log_sums.tolist(), strict=True))
                 collected = time.perf_counter()
-                counts = {key: value.item() for key, value in logs.items() if key.startswith("fault/")}
+                counts = {key: value for key, value in sums.items() if key.startswith("fault/")}
                 self._check_faults(dict(counts))
                 learner.compute_returns(obs)
             losses = learner.update()
@@ -129,7 +130,7 @@ class Trainer:
             self.iteration += 1
             batch = env.num_envs * cfg.num_steps_per_env * self.ranks.size
             self.samples += batch
-            means = {key: value.item() / cfg.num_steps_per_env for key, value in logs.items() if key not in counts}
+            means = {key: value / cfg.num_steps_per_env for key, value in sums.items() if key not in counts}
             episode_return, episode_length = self._episodes.recent()
             scalars = {
                 **means,
@@ -152,14 +153,18 @@ class Trainer:
         if log:
             log.close()
 
-    def collect(self, obs: TensorDict) -> tuple[TensorDict, dict[str, Tensor]]:
-        """Act from `obs` for `ppo.num_steps_per_env` steps and store them; return what is seen last, and the logs' sums."""
-        logs: dict[str, Tensor] = {}
+    def collect(self, obs: TensorDict) -> tuple[TensorDict, Tensor]:
+        """Act from `obs` for `ppo.num_steps_per_env` steps and store them.
+
+        Returns:
+            What is seen last, and the sums of what the environment logs, in the order of `env.log_names`.
+        """
+        logs = torch.zeros(len(self.env.log_names), device=self.env.device)
         for _ in range(self.env.cfg.ppo.num_steps_per_env):
             obs, rewards, dones, extras = self.view.step(self.learner.act(obs))
             self.learner.process_env_step(obs, rewards, dones, extras)
             self._episodes.add(rewards, dones)
-            logs = {key: logs.get(key, 0) + value for key, value in extras["log"].items()}
+            logs += torch.stack(list(extras["log"].values()))
         return obs, logs
 
     def save(self) -> bool:
