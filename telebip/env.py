@@ -175,7 +175,7 @@ class TelebipEnv(VecEnv):
         self.sim.step(self.joint_target, self.push_wrench_w)  # held for `decimation` steps of the engine
         outcome = self._after_physics()
         if self._is_recorded:  # the next replay writes to the same memory
-            outcome = Outcome(*(value if value is None else value.clone() for value in outcome))
+            outcome = Outcome._make(value if value is None else value.clone() for value in outcome)
         extras: dict[str, Any] = {"time_outs": outcome.time_outs}
         extras["log"] = dict(zip(self.log_names, outcome.log.unbind(), strict=True))
         if outcome.final_obs is not None:

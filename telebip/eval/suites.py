@@ -26,7 +26,7 @@ from telebip.eval.push import PushProtocol, push_limits, push_trial
 from telebip.eval.rollout import Rollout, roll_out
 from telebip.eval.walk import heading_velocity, summarise
 from telebip.robot import JOINTS, Robot
-from telebip.sim import Backend
+from telebip.sim import Backend, choose_backend
 
 SUITES = ("tracking", "push", "gait", "learning")
 COMMANDS = (0.5, 0.7, 1.0, -0.3)
@@ -90,6 +90,7 @@ def evaluate(
         "telebip": __version__,
         "date": datetime.now().astimezone().isoformat(timespec="seconds"),
         "machine": f"{platform.machine()}, {protocol.device}",
+        "engine": choose_backend(protocol.backend, protocol.device),
         "protocol": {
             "worlds": protocol.worlds,
             "duration_s": protocol.duration,

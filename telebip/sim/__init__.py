@@ -8,7 +8,14 @@ from telebip.errors import UserError
 from telebip.robot import Robot
 from telebip.sim.base import Backend, SimState, Simulator
 
-__all__ = ["Backend", "SimState", "Simulator", "make_simulator"]
+__all__ = ["Backend", "SimState", "Simulator", "choose_backend", "make_simulator"]
+
+
+def choose_backend(backend: Backend, device: torch.device) -> Backend:
+    """Return the backend that `auto` stands for: `warp` on CUDA and `native` on the CPU."""
+    if backend != "auto":
+        return backend
+    return "warp" if device.type == "cuda" else "native"
 
 
 def make_simulator(
@@ -20,14 +27,12 @@ def make_simulator(
     model_fields: Sequence[str] = (),
     capacity: tuple[int, int] = (8, 64),
 ) -> Simulator:
-    """Create the backend: `auto` is `warp` on CUDA and `native` on the CPU. `capacity` is `warp`'s, see there.
+    """Create the backend, see `choose_backend`. `capacity` is `warp`'s, see there.
 
     Raises:
         UserError: `native` was asked for on a CUDA device.
     """
-    if backend == "auto":
-        backend = "warp" if device.type == "cuda" else "native"
-    if backend == "native":
+    if choose_backend(backend, device) == "native":
         if device.type != "cpu":
             raise UserError(f"backend 'native' runs on the CPU, not on '{device}'; use --backend warp or --device cpu")
         from telebip.sim.native import NativeSimulator

@@ -37,6 +37,7 @@ def results(subject: Subject, robot: Robot) -> dict[str, Any]:
 
 def test_tracking_measures_every_trained_command(results: dict[str, Any]) -> None:
     rows = results["tracking"]
+    assert results["engine"] == "native"
     assert [row["command_mps"] for row in rows] == [0.5, 0.7, 1.0]  # backward was not trained
     for row in rows:
         assert row["mean_speed_mps"] == pytest.approx(row["command_mps"], rel=0.06)
