@@ -52,8 +52,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         results = evaluate(subject, robot, suites, protocol, show)
     write_results(results, out)
     write_report([results], out, f"{subject.label}: how it walks", f"Measured by: {subject.source}", references=references())
-    console.print((out / "report.md").read_text(encoding="utf-8"), markup=False)
-    console.print(f"wrote {out}/results.json, report.md and report.html")
+    lines = (out / "report.md").read_text(encoding="utf-8").splitlines()
+    console.print("\n".join(line for line in lines if not line.startswith("![")), markup=False)
+    console.print(f"wrote {out}/results.json, report.md with its pictures, and report.html")
 
 
 def controller_subject(name: str, label: str | None, overrides: Sequence[str] = ()):
@@ -132,9 +133,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         metavar="A,B",
         help="which suites (default: tracking,push,gait,learning)",
     )
-    parser.add_argument(
-        "--out", metavar="DIR", help="folder of results.json, report.md and report.html (default: reports/<label>)"
-    )
+    parser.add_argument("--out", metavar="DIR", help="folder of results.json and the report (default: reports/<label>)")
     parser.add_argument("--label", metavar="NAME", help="name in tables and plots (default: the task's)")
     parser.add_argument("--num-envs", type=int, default=64, metavar="N", help="worlds for each commanded speed (default: 64)")
     parser.add_argument("--duration", type=float, default=20.0, metavar="S", help="seconds of walking (default: 20)")

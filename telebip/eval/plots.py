@@ -82,13 +82,18 @@ def feet(results: Results) -> Figure:
 
 
 def cost_of_transport(all_results: Sequence[Results], commands: Sequence[float] = (0.5, 0.7, 1.0)) -> Figure:
-    """Cost of transport by method and commanded speed; the article's formula, which is what the article reports."""
-    shown = [(k, r) for k, r in enumerate(all_results) if any(row["command_mps"] in commands for row in r.get("tracking", ()))]
+    """Cost of transport by method and commanded speed, where most worlds walk on; by the formula that the article reports."""
+
+    def walks_on(row: dict[str, Any]) -> bool:
+        return row.get("falls", 0) <= row.get("worlds", 0) / 2
+
+    costs_of = [{row["command_mps"]: row["cot_article"] for row in r.get("tracking", ()) if walks_on(row)} for r in all_results]
+    shown = [k for k, costs in enumerate(costs_of) if costs.keys() & set(commands)]
     with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(figsize=(7.2, 3.0))
+        figure, axes = plt.subplots(figsize=(7.2 + 0.6 * max(0, len(shown) - 6), 3.0))
         width = 0.84 / max(1, len(shown))
-        for i, (k, results) in enumerate(shown):
-            costs = {row["command_mps"]: row["cot_article"] for row in results["tracking"]}
+        for i, k in enumerate(shown):
+            results, costs = all_results[k], costs_of[k]
             x = [at + (i - 0.5 * (len(shown) - 1)) * width for at, command in enumerate(commands) if command in costs]
             y = [costs[command] for command in commands if command in costs]
             bars = axes.bar(x, y, 0.92 * width, color=color(k, results["label"]), label=results["label"])

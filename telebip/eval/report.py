@@ -18,7 +18,7 @@ Table = tuple[str, list[str], list[list[str]]]
 def write_report(
     all_results: Sequence[Results], out: Path, title: str, text: str = "", references: Sequence[Results] = ()
 ) -> None:
-    """Write `report.md` and `report.html` about one or several walkers to the folder `out`.
+    """Write `report.md`, its pictures, and `report.html`, complete in one file, about walkers to the folder `out`.
 
     Args:
         all_results: as `telebip.eval.suites.evaluate` returns them.
@@ -29,9 +29,14 @@ def write_report(
     """
     tables = [table for table in _tables([*all_results, *references]) if table[2]]
     markdown = [f"# {title}", *([text] if text else [])]
-    markdown += [f"## {heading}\n\n{_markdown(header, rows)}" for heading, header, rows in tables]
     page = [f"<h1>{html.escape(title)}</h1>", *(f"<p>{html.escape(p)}</p>" for p in text.split("\n\n") if p)]
-    page += [f"<figure>{plots.svg(figure())}</figure>" for figure in _figures(all_results, references)]
+    for name, figure in _comparisons(all_results, references):
+        picture = plots.svg(figure())
+        write(out / f"{name}.svg", picture)
+        markdown.append(f"![{name.replace('_', ' ')}]({name}.svg)")
+        page.append(f"<figure>{picture}</figure>")
+    markdown += [f"## {heading}\n\n{_markdown(header, rows)}" for heading, header, rows in tables]
+    page += [f"<figure>{plots.svg(figure())}</figure>" for figure in _portraits(all_results)]
     page += [f"<h2>{html.escape(heading)}</h2>{_html(header, rows)}" for heading, header, rows in tables]
     write(out / "report.md", "\n\n".join(markdown) + "\n")
     write(out / "report.html", _PAGE.format(title=html.escape(title), body="\n".join(page)))
@@ -83,16 +88,23 @@ def write(path: Path, text: str) -> None:
         raise UserError(f"cannot write '{path}': {error.strerror or error}") from error
 
 
-def _figures(all_results: Sequence[Results], references: Sequence[Results]) -> list[Callable[[], Any]]:
+def _comparisons(all_results: Sequence[Results], references: Sequence[Results]) -> list[tuple[str, Callable[[], Any]]]:
+    """Return the pictures of all walkers together, with the names of their files."""
     together = [*all_results, *references]
-    figures: list[Callable[[], Any]] = []
+    figures: list[tuple[str, Callable[[], Any]]] = []
     if any("tracking" in r for r in all_results):
-        figures.append(lambda: plots.cost_of_transport(together))
+        figures.append(("cost_of_transport", lambda: plots.cost_of_transport(together)))
     for horizon in ("10s", "20s"):
         if any(horizon in (r.get("push") or {}) for r in all_results):
-            figures.append(lambda horizon=horizon: plots.push(together, horizon))
+            figures.append((f"push_{horizon}", lambda horizon=horizon: plots.push(together, horizon)))
     if any(r.get("learning") for r in all_results):
-        figures.append(lambda: plots.learning(all_results))
+        figures.append(("learning", lambda: plots.learning(all_results)))
+    return figures
+
+
+def _portraits(all_results: Sequence[Results]) -> list[Callable[[], Any]]:
+    """Return the pictures of each walker alone."""
+    figures: list[Callable[[], Any]] = []
     for results in all_results:
         if "series" in results:
             figures.append(lambda r=results: plots.speed(r))

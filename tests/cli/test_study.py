@@ -13,7 +13,7 @@ SMALL = ("--num-envs", "2", "--duration", "2", "--device", "cpu")
 def test_evaluate_writes_results_and_reports(tmp_path: Path) -> None:
     policy = ("--checkpoint", "assets/policies/telebip_flat", "--suite", "tracking,gait", "--commands", "0.7")
     printed = ran(EVALUATE, *policy, *SMALL, "--out", str(tmp_path), "--label", "mine")
-    assert {file.name for file in tmp_path.iterdir()} == {"results.json", "report.md", "report.html"}
+    assert {file.name for file in tmp_path.iterdir()} == {"results.json", "report.md", "report.html", "cost_of_transport.svg"}
     results = json.loads((tmp_path / "results.json").read_text())
     assert (results["label"], [row["command_mps"] for row in results["tracking"]]) == ("mine", [0.7])
     assert "push" not in results

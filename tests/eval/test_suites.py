@@ -13,6 +13,7 @@ from telebip import ROOT
 from telebip.cli.evaluate import references, subject_of
 from telebip.control.policy import Stateless
 from telebip.errors import UserError
+from telebip.eval import plots
 from telebip.eval.learning import learning_curve, samples_to
 from telebip.eval.push import PushProtocol
 from telebip.eval.report import read_results, write_report, write_results
@@ -96,6 +97,14 @@ def test_the_report_shows_the_numbers_beside_the_articles_in_one_file(results: d
     assert page.count("<svg") == 4  # cost of transport, speed, feet, joints: there is no push of ten seconds here
     assert "How &lt;it&gt; walks" in page
     assert not re.search(r"(src|href)=\"http", page)  # complete in itself
+    assert re.findall(r"!\[.*\]\((.*)\)", markdown) == ["cost_of_transport.svg"]
+    assert (tmp_path / "cost_of_transport.svg").read_text().startswith("<svg")
+
+
+def test_who_falls_has_no_bar_in_the_cost_of_transport(results: dict[str, Any]) -> None:
+    fallen = results | {"label": "falls", "tracking": [row | {"falls": row["worlds"]} for row in results["tracking"]]}
+    figure = plots.cost_of_transport([results, fallen])
+    assert figure.axes[0].get_legend_handles_labels()[1] == [results["label"]]
 
 
 def test_broken_results_are_named(tmp_path: Path) -> None:
