@@ -40,7 +40,9 @@ class FaultRecorder:
         first, new = faults.byte().argmax(1), faults.any(1) & ~self._seen
         for name, value in {"step": step.expand_as(self._world), "world": self._world, **world}.items():
             rows = value.index_select(0, first)
-            kept = self._records.setdefault(name, torch.zeros_like(rows))
+            if name not in self._records:
+                self._records[name] = torch.zeros_like(rows)
+            kept = self._records[name]
             kept.copy_(torch.where(new.view(-1, *[1] * (rows.dim() - 1)), rows, kept))
         self._seen |= new
 
