@@ -1,5 +1,6 @@
 """Random draws: initial states, pushes, ground friction, commands, noise. All from one seeded generator per environment."""
 
+import itertools
 import math
 
 import torch
@@ -42,20 +43,26 @@ class Draws:
     """Numbers, uniform in their ranges, for all worlds: `draws[name]` is (num_envs, size), and `draw` writes new ones to it.
 
     Every world gets its own numbers at every step, needed or not, so that shapes are static and what happens to one world
-    changes nothing for the others.
+    changes nothing for the others. Each is one of 65,536 values, evenly spaced from the low bound on: four of them come from
+    64 random bits, in a third of the time of four floats.
     """
 
     def __init__(self, ranges: Ranges, num_envs: int, device: torch.device) -> None:
         """Allocate them on `device`."""
-        self._low, high = torch.tensor([bound for bounds in ranges.values() for bound in bounds], device=device).unbind(1)
-        self._span = high - self._low
-        self._values = torch.zeros(num_envs, len(high), device=device)
-        parts = self._values.split([len(bounds) for bounds in ranges.values()], dim=1)
-        self._parts = dict(zip(ranges, parts, strict=True))
+        bounds = [bound for bounds in ranges.values() for bound in bounds]
+        bounds += [(0.0, 0.0)] * (-len(bounds) % 4)
+        low, high = torch.tensor(bounds, device=device).unbind(1)
+        self._middle, self._spacing = 0.5 * (low + high), (high - low) / 2**16
+        self._bits = torch.zeros(num_envs, len(bounds) // 4, dtype=torch.int64, device=device)
+        self._values = torch.zeros(num_envs, len(bounds), device=device)
+        ends = list(itertools.accumulate(len(bounds) for bounds in ranges.values()))
+        self._parts = dict(zip(ranges, self._values.tensor_split(ends, dim=1), strict=False))
 
     def draw(self, generator: torch.Generator) -> None:
         """Draw all anew."""
-        torch.addcmul(self._low, self._span, self._values.uniform_(generator=generator), out=self._values)
+        self._bits.random_(-(2**63), None, generator=generator)
+        self._values.copy_(self._bits.view(torch.int16))  # -32768 to 32767
+        torch.addcmul(self._middle, self._spacing, self._values, out=self._values)
 
     def __getitem__(self, name: str) -> Tensor:
         """Return the present numbers of a range, (num_envs, size)."""
