@@ -1,4 +1,4 @@
-"""The policy that comes with the repository walks as docs/results.md says."""
+"""The policies that come with the repository walk as docs/results.md says."""
 
 import numpy as np
 import pytest
@@ -15,10 +15,22 @@ from telebip.sim import Backend
 
 SPEEDS = (0.5, 0.7, 1.0)  # m/s
 
+OTHERS = {
+    "telebip_efficient": (0.7, 0.698),
+    "telebip_robust": (0.7, 0.683),
+    "period_06": (0.7, 0.707),
+    "telebip_slow": (0.7, 0.697),
+    "telebip_fast": (1.0, 1.054),
+    "telebip_backward": (-0.3, -0.377),
+}
+"""Commanded and published mean speed [m/s]."""
 
-def walk(robot: Robot, speed: float, worlds: int, seconds: float, backend: Backend = "native") -> Rollout:
-    """Walk the shipped policy without disturbances, from random initial velocities."""
-    checkpoint = load_checkpoint(ROOT / "assets" / "policies" / "telebip_flat")
+
+def walk(
+    robot: Robot, speed: float, worlds: int, seconds: float, backend: Backend = "native", policy: str = "telebip_flat"
+) -> Rollout:
+    """Walk a shipped policy without disturbances, from random initial velocities."""
+    checkpoint = load_checkpoint(ROOT / "assets" / "policies" / policy)
     calm = [f"disturbance.{name}.enabled=false" for name in ("push", "friction", "noise")]
     config = load_task(checkpoint.config, [f"num_envs={worlds}", f"episode.length={seconds + 1}", *calm])
     env = TelebipEnv(config, robot, "cpu", backend)
@@ -32,6 +44,15 @@ def test_it_walks_at_the_commanded_speed(robot: Robot, speed: float) -> None:
     assert summary.falls == 0
     assert summary.speed[0] == pytest.approx(speed, rel=0.05)
     assert summary.gait_period == pytest.approx(0.5, rel=0.02)
+
+
+@pytest.mark.parametrize("policy", OTHERS)
+def test_the_others_walk_as_fast_as_published(robot: Robot, policy: str) -> None:
+    command, published = OTHERS[policy]
+    summary = summarise(walk(robot, command, worlds=4, seconds=8.0, policy=policy), skip=4.0)
+    assert summary.falls == 0
+    assert summary.speed[0] == pytest.approx(published, rel=0.03)
+    assert summary.gait_period == pytest.approx(0.6 if policy == "period_06" else 0.5, rel=0.02)
 
 
 def test_its_feet_take_turns(robot: Robot) -> None:
