@@ -98,7 +98,7 @@ def cost_of_transport(all_results: Sequence[Results], commands: Sequence[float] 
             y = [costs[command] for command in commands if command in costs]
             bars = axes.bar(x, y, 0.92 * width, color=color(k, results["label"]), label=results["label"])
             axes.bar_label(bars, fmt="%.2f", fontsize=7, padding=1)
-        axes.set_xticks(range(len(commands)), [f"{command:g} m/s" for command in commands])
+        axes.set_xticks(range(len(commands)), [f"{command:.1f} m/s" for command in commands])
         axes.grid(axis="x", visible=False)
         axes.set(ylabel="cost of transport [-]", title="Cost of transport (lower is better)")
         axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
