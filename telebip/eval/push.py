@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -60,7 +61,7 @@ def largest_survived(survived: NDArray[np.bool_], forces: NDArray[np.floating]) 
     return float(forces[passed - 1]) if passed else 0.0
 
 
-def push_limits(survival_s: NDArray[np.floating], protocol: PushProtocol, weight: float) -> dict[str, dict[str, float]]:
+def push_limits(survival_s: NDArray[np.floating], protocol: PushProtocol, weight: float) -> dict[str, dict[str, Any]]:
     """Reduce survival times to limits.
 
     Args:
@@ -71,7 +72,8 @@ def push_limits(survival_s: NDArray[np.floating], protocol: PushProtocol, weight
 
     Returns:
         For each horizon ("10s"): `forward_n`, `backward_n`, `lateral_n` (of left and right the worse) [N], the same as impulses
-        (`forward_ns` [N s]) and as fractions of the weight (`forward_bw` [-]).
+        (`forward_ns` [N s]) and as fractions of the weight (`forward_bw` [-]); and `survivors`, how many worlds survive each
+        force, by direction: a limit may be low because of a single fall, or of a weakness for small pushes.
     """
     table = {}
     for horizon in protocol.horizons:
@@ -81,6 +83,7 @@ def push_limits(survival_s: NDArray[np.floating], protocol: PushProtocol, weight
             **{f"{name}_n": value for name, value in force.items()},
             **{f"{name}_ns": round(value * protocol.duration, 6) for name, value in force.items()},
             **{f"{name}_bw": round(value / weight, 4) for name, value in force.items()},
+            "survivors": {name: (survival_s[:, i] >= horizon).sum(1).tolist() for i, name in enumerate(DIRECTIONS)},
         }
     return table
 

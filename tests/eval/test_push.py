@@ -37,6 +37,13 @@ def test_limits_of_each_horizon_and_the_worse_side() -> None:
         "lateral": 5.0,
     }
     assert limits["20s"]["forward_n"] == 15.0
+    assert limits["10s"]["survivors"] == {
+        "forward": [1, 1, 1, 1],
+        "backward": [1, 1, 0, 0],
+        "left": [1, 1, 1, 0],
+        "right": [1, 0, 0, 0],
+    }
+    assert limits["20s"]["survivors"]["forward"] == [1, 1, 1, 0]
     assert limits["10s"]["forward_ns"] == pytest.approx(2.0)  # 20 N for 0.1 s
     assert limits["10s"]["forward_bw"] == pytest.approx(0.2)
 

@@ -51,7 +51,10 @@ def test_tracking_measures_every_trained_command(results: dict[str, Any]) -> Non
 def test_gait_and_pushes(results: dict[str, Any]) -> None:
     assert results["gait"]["period_s"] == pytest.approx(0.5, rel=0.02)
     assert 0.8 < results["gait"]["symmetry"] <= 1.0
+    survivors = results["push"]["1s"]["survivors"]
+    assert survivors == dict.fromkeys(("forward", "backward", "left", "right"), [1, 1])
     assert results["push"]["1s"] == {
+        "survivors": survivors,
         **dict.fromkeys(("forward_n", "backward_n", "lateral_n"), 10.0),
         **dict.fromkeys(("forward_ns", "backward_ns", "lateral_ns"), 1.0),
         **dict.fromkeys(("forward_bw", "backward_bw", "lateral_bw"), round(10.0 / (13.6 * 9.81), 4)),
