@@ -52,7 +52,7 @@ def test_gait_and_pushes(results: dict[str, Any]) -> None:
     assert results["gait"]["period_s"] == pytest.approx(0.5, rel=0.02)
     assert 0.8 < results["gait"]["symmetry"] <= 1.0
     survivors = results["push"]["1s"]["survivors"]
-    assert survivors == dict.fromkeys(("forward", "backward", "left", "right"), [1, 1])
+    assert survivors == {direction: [1, 1] for direction in ("forward", "backward", "left", "right")}
     assert results["push"]["1s"] == {
         "survivors": survivors,
         **dict.fromkeys(("forward_n", "backward_n", "lateral_n"), 10.0),
