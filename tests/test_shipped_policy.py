@@ -18,9 +18,9 @@ SPEEDS = (0.5, 0.7, 1.0)  # m/s
 OTHERS = {
     "telebip_efficient": (0.7, 0.698),
     "telebip_robust": (0.7, 0.722),
-    "period_06": (0.7, 0.707),
-    "telebip_slow": (0.7, 0.697),
-    "telebip_fast": (1.0, 1.054),
+    "period_06": (0.7, 0.677),
+    "telebip_slow": (0.7, 0.662),
+    "telebip_fast": (1.0, 0.998),
     "telebip_backward": (-0.3, -0.377),
 }
 """Commanded and published mean speed [m/s]."""
