@@ -9,6 +9,7 @@ from telebip.env import TelebipEnv
 from telebip.eval.rollout import Rollout, roll_out
 from telebip.eval.walk import summarise
 from telebip.rl.checkpoint import load_checkpoint
+from telebip.rl.curve import read_curve
 from telebip.rl.policy import load_policy
 from telebip.robot import Robot
 from telebip.sim import Backend
@@ -53,6 +54,13 @@ def test_the_others_walk_as_fast_as_published(robot: Robot, policy: str) -> None
     assert summary.falls == 0
     assert summary.speed[0] == pytest.approx(published, rel=0.03)
     assert summary.gait_period == pytest.approx(0.6 if policy == "period_06" else 0.5, rel=0.02)
+
+
+@pytest.mark.parametrize("policy", OTHERS)
+def test_their_learning_curves_are_whole(policy: str) -> None:
+    curve = read_curve(ROOT / "assets" / "policies" / policy)
+    assert [row["iteration"] for row in curve] == list(range(1, len(curve) + 1))
+    assert curve[-1]["samples"] == pytest.approx(load_checkpoint(policy).samples, rel=1e-4)
 
 
 def test_its_feet_take_turns(robot: Robot) -> None:
