@@ -85,7 +85,7 @@ def subject_of(checkpoint_path: str, label: str | None, overrides: Sequence[str]
         config=load_task(checkpoint.config, overrides),
         make_policy=lambda env: load_policy(checkpoint, env.device),
         run_dir=checkpoint.path.parent,
-        source=f"evaluate.py --checkpoint {checkpoint_path}",
+        source=" ".join(["evaluate.py --checkpoint", checkpoint_path, *overrides]),
         fingerprint=sha256(checkpoint.path.read_bytes()).hexdigest()[:16],
     )
 

@@ -4,7 +4,6 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from telebip import ROOT
 from telebip.cli.common import Parser, open_checkpoint, resolve_device
 from telebip.cli.evaluate import controller_subject, progress_bar, references, subject_of
 from telebip.config import load_task
@@ -18,7 +17,7 @@ EXAMPLES = """\
 """
 
 QUICK_TRAINING = ("num_envs=64", "ppo.max_iterations=2", "ppo.hidden_dims=[32,32]")
-SHIPPED = ROOT / "assets" / "policies"
+SHIPPED = Path("assets/policies")  # of telebip's own folder
 INTRODUCTION = (
     "Reinforcement learning and two model-based walkers on one robot, measured by one evaluator; in grey, and in the last "
     "rows, the article's own numbers, which belong to its own robot. Trainings: {trainings}. Every number comes from "
