@@ -22,7 +22,7 @@ OTHERS = {
     "period_06": (0.7, 0.677),
     "telebip_slow": (0.7, 0.662),
     "telebip_fast": (1.0, 0.998),
-    "telebip_backward": (-0.3, -0.377),
+    "telebip_backward": (-0.3, -0.334),
 }
 """Commanded and published mean speed [m/s]."""
 
