@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 Results = dict[str, Any]
 
-COLORS = ("#e8731f", "#29598f", "#3f8f5f", "#8a5aa8", "#c2455a", "#7a6a3a", "#2f9fa8", "#555b66")
+COLORS = ("#e8731f", "#29598f", "#3f8f5f", "#8a5aa8", "#c2455a", "#7a6a3a", "#2f9fa8", "#555b66", "#d9b02c", "#7fb3e0")
 GREYS = ("#9aa0a8", "#b6bac0", "#ced1d6")
 STYLE: Any = {
     "font.size": 9,
