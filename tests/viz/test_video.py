@@ -64,7 +64,7 @@ def test_both_robots_are_in_view_all_the_time(mp4: Frames) -> None:
         assert columns.min() > 5 and columns.max() < 315  # pixels from the edges
         assert rows.min() > 5 and rows.max() < 120
         filled = np.flatnonzero(shell.any(0))
-        assert np.diff(filled).max() > 10  # a gap: two trunks, not one
+        assert np.diff(filled).max() > 5  # a gap: two trunks, not one
 
 
 def test_the_film_moves(mp4: Frames) -> None:
