@@ -35,7 +35,8 @@ STYLE: Any = {
 def svg(figure: Figure) -> str:
     """Return a figure as an SVG element, and close it."""
     buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", bbox_inches="tight", metadata={"Date": None})
+    with plt.rc_context(STYLE):
+        figure.savefig(buffer, format="svg", bbox_inches="tight", metadata={"Date": None})
     plt.close(figure)
     text = buffer.getvalue()
     return text[text.index("<svg") :]
@@ -159,7 +160,7 @@ def learning(all_results: Sequence[Results]) -> Figure:
         right.set(xlabel="million samples", ylabel="m/s", title="Velocity error in training")
         for axes in (left, right):
             axes.set_ylim(bottom=0)
-        right.legend()
+        right.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure
 
 

@@ -51,10 +51,10 @@ class NativeSimulator:
         self._batch = Batch(model, num_envs, num_threads)
         self.memory = {name: torch.from_numpy(self._batch.bind(name)) for name in ("time", "qpos", "qvel", "qacc_warmstart")}
         self._time, self._qpos, self._qvel, self._warmstart = self.memory.values()
-        sizes = (1, model.nq, model.nv, model.nv)
-        self._memory = torch.from_numpy(self._batch.state)[:, : sum(sizes)]  # the same, in one piece: copied at once
+        widths = (1, model.nq, model.nv, model.nv)
+        self._memory = torch.from_numpy(self._batch.state)[:, : sum(widths)]  # the same, in one piece: copied at once
         self._memory_before = self._memory.clone()
-        self.memory_before = dict(zip(self.memory, self._memory_before.split(sizes, dim=1), strict=True))
+        self.memory_before = dict(zip(self.memory, self._memory_before.split(widths, dim=1), strict=True))
         self.memory_before["time"] = self.memory_before["time"][:, 0]
         self._ctrl = torch.from_numpy(self._batch.bind("ctrl"))
         self.advice = {"capacity": 'raise <size memory="..."/> in the MJCF'}

@@ -101,7 +101,7 @@ class WarpSimulator:
             wp.to_torch(a) for a in (self._data.ctrl, self._data.qacc_warmstart, self._data.time)
         )
         self.memory = {"qpos": state.qpos, "qvel": state.qvel, "qacc_warmstart": self._warmstart, "time": self._time}
-        self._live = [self._data.qpos, self._data.qvel, self._data.qacc_warmstart, self._data.time]
+        self._live = [wp.from_torch(memory) for memory in self.memory.values()]
         self._copies = [wp.clone(array) for array in self._live]
         self.memory_before = {name: wp.to_torch(copy) for name, copy in zip(self.memory, self._copies, strict=True)}
         self._trunk_wrench = wp.to_torch(self._data.xfrc_applied)[:, robot.trunk_id]

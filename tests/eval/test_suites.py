@@ -110,6 +110,10 @@ def test_who_falls_has_no_bar_in_the_cost_of_transport(results: dict[str, Any]) 
     assert figure.axes[0].get_legend_handles_labels()[1] == [results["label"]]
 
 
+def test_the_same_numbers_give_the_same_picture(results: dict[str, Any]) -> None:
+    assert plots.svg(plots.cost_of_transport([results])) == plots.svg(plots.cost_of_transport([results]))
+
+
 def test_broken_results_are_named(tmp_path: Path) -> None:
     file = tmp_path / "results.json"
     for content in ("{", "[]", '{"schema": "other"}'):
