@@ -26,7 +26,7 @@ def urdf(robot: Robot) -> Path:
 def walking(robot: Robot) -> Rollout:
     """Three worlds of the shipped policy that walk at 0.7 m/s and are pushed within the first second."""
     checkpoint = load_checkpoint(ROOT / "assets" / "policies" / "telebip_flat")
-    overrides = ["num_envs=3", "episode.reset_heading=0", "disturbance.push.interval=[0.3,0.6]"]
+    overrides = ["seed=2", "num_envs=3", "episode.reset_heading=0", "disturbance.push.interval=[0.3,0.6]"]
     env = TelebipEnv(load_task(checkpoint.config, overrides), robot, "cpu", "native")
     env.set_command(0.7, 0.0, 0.0)
     return roll_out(env, load_policy(checkpoint, "cpu"), STEPS)
