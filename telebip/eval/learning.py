@@ -28,12 +28,12 @@ def learning_curve(run_dir: Path, points: int = 200) -> dict[str, Any] | None:
     """
     if not (run_dir / FILE).is_file():
         return None
+    rows = read_curve(run_dir)
     try:
-        rows = read_curve(run_dir)
         samples = [row["samples"] for row in rows]
         curves = {name: [row[column] for row in rows] for name, column in COLUMNS.items()}
-    except (ValueError, KeyError, TypeError, UnicodeDecodeError) as error:
-        raise UserError(f"{run_dir / FILE} is damaged: {error}") from error
+    except KeyError as error:
+        raise UserError(f"{run_dir / FILE} is damaged: it has no column {error}") from error
     every = max(1, -(-len(rows) // points))
     return {
         "samples": samples[::every],

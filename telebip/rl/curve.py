@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from telebip.errors import UserError
 from telebip.files import write_atomically
 
 FILE = "learning.csv"
@@ -24,8 +25,9 @@ class CurveWriter:
     def add(self, row: Mapping[str, float]) -> None:
         """Append one iteration's numbers; where an older version wrote other columns, they are NaN, as are its in this row."""
         if not row.keys() <= set(self._columns):
+            rows = read_curve(self._path.parent)
             self._columns += [name for name in row if name not in self._columns]
-            self._write(read_curve(self._path.parent))
+            self._write(rows)
         with self._path.open("a", newline="", encoding="utf-8") as file:
             csv.writer(file).writerow(f"{row.get(name, math.nan):.6g}" for name in self._columns)
 
@@ -45,8 +47,24 @@ def read_curve(run_dir: Path) -> list[dict[str, float]]:
 
     Raises:
         OSError: there is no such file.
-        ValueError: it holds something other than numbers.
+        UserError: its lines are not all numbers under the first one's names, among them "samples".
     """
-    with (run_dir / FILE).open(newline="", encoding="utf-8") as file:
-        finished = [line for line in file if line.endswith("\n")]
-    return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(finished)]
+    path = run_dir / FILE
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            finished = [line for line in file if line.endswith("\n")]
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path} is damaged: {error}") from error
+    table = csv.reader(finished)
+    names = next(table, ["samples"])
+    if "samples" not in names:
+        raise UserError(f"{path} is damaged: its first line names no column 'samples'")
+    rows = []
+    for line in table:
+        try:
+            if len(line) != len(names):
+                raise ValueError(f"{len(line)} numbers under {len(names)} names")
+            rows.append(dict(zip(names, map(float, line), strict=True)))
+        except ValueError as error:
+            raise UserError(f"{path} is damaged at line {table.line_num}: {error}") from error
+    return rows

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
+from telebip.errors import UserError
 from telebip.rl.curve import CurveWriter
 
 
@@ -39,9 +40,9 @@ class RunLog:
     def _tolerant(self) -> Iterator[None]:
         try:
             yield
-        except OSError as error:
+        except (OSError, UserError) as error:
             if not self._noted:
-                self._note(f"cannot write the curves: {error.strerror or error}; they will lack rows")
+                self._note(f"cannot write the curves: {getattr(error, 'strerror', None) or error}; they will lack rows")
             self._noted = True
 
 

@@ -154,5 +154,8 @@ def test_a_learning_curve_is_thinned_and_a_damaged_one_named(tmp_path: Path) -> 
     assert len(curve["samples"]) == 20
     assert curve["samples_to_95_length"] == 48_000.0
     (tmp_path / "learning.csv").write_text("samples,train/episode_length\n1000,many\n")
-    with pytest.raises(UserError, match=r"learning\.csv is damaged"):
+    with pytest.raises(UserError, match=r"learning\.csv is damaged at line 2: could not convert string to float: 'many'"):
+        learning_curve(tmp_path)
+    (tmp_path / "learning.csv").write_text("samples,train/episode_length\n1000,500\n")
+    with pytest.raises(UserError, match=r"learning\.csv is damaged: it has no column 'train/episode_return'"):
         learning_curve(tmp_path)

@@ -1,6 +1,7 @@
 """Training in real worlds: what a run leaves, how it goes on, and that it can be repeated."""
 
 import math
+import re
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,7 @@ from telebip.errors import UserError
 from telebip.mdp.rewards import REWARDS
 from telebip.rl.checkpoint import load_checkpoint
 from telebip.rl.curve import CurveWriter, read_curve
-from telebip.rl.log import EpisodeStatistics
+from telebip.rl.log import EpisodeStatistics, RunLog
 from telebip.rl.policy import load_policy
 from telebip.rl.train import Trainer, min_std
 from telebip.robot import Robot
@@ -135,6 +136,36 @@ def test_a_curve_takes_new_columns(tmp_path: Path) -> None:
     with (tmp_path / "learning.csv").open("a") as file:
         file.write("3,4")  # killed while it was writing
     assert len(read_curve(tmp_path)) == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("samples,loss\n1,2\n2,3,4\n", "at line 3: 3 numbers under 2 names"),
+        ("samples,loss\n1,2\n2\n", "at line 3: 1 numbers under 2 names"),
+        ("samples,loss\n1,many\n", "at line 2: could not convert string to float: 'many'"),
+        ("1,2\n", "its first line names no column 'samples'"),
+    ],
+)
+def test_a_damaged_curve_is_named_before_a_run_goes_on(robot: Robot, tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "learning.csv").write_text(text)
+    with pytest.raises(UserError, match=re.escape(message)):
+        train(robot, tmp_path, 1)
+    assert (tmp_path / "learning.csv").read_text() == text
+
+
+def test_a_curve_damaged_during_a_run_costs_its_rows_and_no_more(tmp_path: Path) -> None:
+    notes: list[str] = []
+    log = RunLog(tmp_path, 0, notes.append)
+    log.add(1, 80, {"loss": 1.0})
+    with (tmp_path / "learning.csv").open("a") as file:
+        file.write("saved,by,a,spreadsheet\n")
+    log.add(2, 160, {"loss": 1.0, "new": 2.0})
+    log.add(3, 240, {"loss": 1.0, "new": 2.0})
+    log.close()
+    assert (tmp_path / "learning.csv").read_text().splitlines()[2:] == ["saved,by,a,spreadsheet"]
+    assert len(notes) == 1 and "learning.csv is damaged at line 3" in notes[0]
+    assert [samples for samples, _ in scalars(tmp_path)["loss"]] == [80, 160, 240]
 
 
 def test_episode_statistics_by_hand() -> None:
