@@ -1,5 +1,6 @@
 """The vectorised environment: the order of one step, and nothing else. Every term it calls lives in `telebip.mdp`."""
 
+import functools
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -10,7 +11,7 @@ from torch import Tensor
 
 from telebip.config import TaskConfig
 from telebip.graph import CudaGraph
-from telebip.math import rotate_inverse, wrap_angle, yaw
+from telebip.math import columns, norm, rotate_inverse, wrap_angle, yaw, zeros
 from telebip.mdp import gait, terminations
 from telebip.mdp.actions import action_scale, joint_targets
 from telebip.mdp.commands import hold_heading
@@ -89,8 +90,7 @@ class TelebipEnv(VecEnv):
         def constant(values) -> Tensor:
             return torch.as_tensor(values, dtype=torch.float32, device=self.device)
 
-        def zeros(*shape: int) -> Tensor:
-            return torch.zeros(self.num_envs, *shape, device=self.device)
+        buffer = functools.partial(zeros, self.num_envs, device=self.device)
 
         window = gait.window_length(cfg.gait.period, self.step_dt)
         self._home_qpos, self._nominal, self._force_limit = map(constant, (robot.home_qpos, robot.nominal, robot.force_limit))
@@ -100,23 +100,23 @@ class TelebipEnv(VecEnv):
         self._friction = self.sim.model_fields["geom_friction"][:, robot.engine_floor_id, 0]  # live, one per world
 
         self._episode_length = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)  # policy steps since reset
-        self._given = zeros(6)  # the policy's actions as they came
+        self._given = buffer(6)  # the policy's actions as they came
         self._finite = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)  # and whether they are numbers
-        self._action = zeros(6)  # A_t, zero where they are not
-        self.last_action = zeros(6)
-        self.joint_target = zeros(6)  # [rad | m]
-        self.command = zeros(3)  # what the policy sees: the target command and the heading hold's correction
-        self.target_command = zeros(3)
-        self.reference_heading = zeros()  # [rad]
+        self._action = buffer(6)  # A_t, zero where they are not
+        self.last_action = buffer(6)
+        self.joint_target = buffer(6)  # [rad | m]
+        self.command = buffer(3)  # what the policy sees: the target command and the heading hold's correction
+        self.target_command = buffer(3)
+        self.reference_heading = buffer()  # [rad]
         self.reward_names = tuple(self._rewards)
         self.log_names = (*(f"reward/{name}" for name in self._rewards), *LOG, *(f"fault/{kind}" for kind in KINDS))
         self.reward_terms = torch.zeros(len(self._rewards), self.num_envs, device=self.device)  # of the last step
-        self.push_wrench_w = zeros(6)  # on the trunk's centre of mass, world frame [N, N m]
-        self._push_timer = zeros()  # time until the next push starts [s]
-        self._push_time_left = zeros()  # of the present push [s]
-        self._command_timer = zeros()  # time until the next command [s]
-        self._foot_window = zeros(window)
-        self._base_lin_vel_b = zeros(3)
+        self.push_wrench_w = buffer(6)  # on the trunk's centre of mass, world frame [N, N m]
+        self._push_timer = buffer()  # time until the next push starts [s]
+        self._push_time_left = buffer()  # of the present push [s]
+        self._command_timer = buffer()  # time until the next command [s]
+        self._foot_window = buffer(window)
+        self._base_lin_vel_b = buffer(3)
         self._energy_share = torch.ones((), device=self.device)
         self._push_share = torch.ones((), device=self.device)
         self._command_is_fixed = torch.zeros((), dtype=torch.bool, device=self.device)
@@ -253,7 +253,7 @@ class TelebipEnv(VecEnv):
         obs = observation(state, self._nominal, self.last_action, self._base_lin_vel_b, quat, self.command, self.phase)
         if self.cfg.disturbance.noise.enabled:
             obs += self._noise
-        return obs
+        return obs.contiguous()  # by rows, as everyone expects
 
     def _observed(self, obs: Tensor) -> TensorDict:
         return TensorDict({"policy": obs}, batch_size=[self.num_envs], device=self.device)
@@ -348,14 +348,14 @@ class TelebipEnv(VecEnv):
     def _log(self, context: StepContext, terms: Tensor, faults: Tensor) -> Tensor:
         """Return what `log_names` names; faulty worlds are left out of all but their own numbers."""
         state, fault = context.state, faults.any(0)
-        error = context.command - torch.cat([context.base_lin_vel_b[:, :2], state.base_ang_vel_b[:, 2:]], dim=1)
+        error = context.command - columns(context.base_lin_vel_b[:, :2], state.base_ang_vel_b[:, 2])
         rows = torch.stack(
             [
                 *terms,
-                torch.linalg.vector_norm(error[:, :2], dim=1),
+                norm(error[:, :2]),
                 error[:, 2].abs(),
                 state.joint_power.sum(1),
-                torch.linalg.vector_norm(context.base_lin_vel_b[:, :2], dim=1),
+                norm(context.base_lin_vel_b[:, :2]),
                 context.fallen.float(),
             ]
         )

@@ -1,9 +1,8 @@
 """The heading hold of the velocity command."""
 
-import torch
 from torch import Tensor
 
-from telebip.math import wrap_angle
+from telebip.math import columns, wrap_angle
 
 
 def hold_heading(command: Tensor, heading: Tensor, reference: Tensor, gain: float, limit: float) -> Tensor:
@@ -24,4 +23,4 @@ def hold_heading(command: Tensor, heading: Tensor, reference: Tensor, gain: floa
         The command that the policy sees and is rewarded for, (num_envs, 3).
     """
     correction = (gain * wrap_angle(reference - heading)).clamp(-limit, limit)
-    return torch.cat([command[:, :2], (command[:, 2] + correction)[:, None]], dim=1)
+    return columns(command[:, :2], command[:, 2] + correction)

@@ -5,6 +5,8 @@ import math
 import torch
 from torch import Tensor
 
+from telebip.math import columns
+
 
 def phase_signals(time: Tensor, period: float) -> Tensor:
     r"""Phase signals that ask the feet to carry the robot in turn.
@@ -19,7 +21,7 @@ def phase_signals(time: Tensor, period: float) -> Tensor:
         (p_r, p_l) [-], (num_envs, 2). Positive where the foot is asked to press on the ground.
     """
     p_r = torch.sin(2.0 * math.pi / period * time)
-    return torch.stack([p_r, -p_r], dim=1)
+    return columns(p_r, -p_r)
 
 
 def window_length(period: float, step_dt: float) -> int:
@@ -70,4 +72,4 @@ def foot_sample(phase: Tensor, foot_force: Tensor, weight: float, cap: float) ->
 
 def push_sample(window: Tensor, sample: Tensor) -> Tensor:
     """Return `window` (num_envs, length) with `sample` (num_envs,) at its front and its oldest entry dropped."""
-    return torch.cat([sample[:, None], window[:, :-1]], dim=1)
+    return columns(sample, window[:, :-1])

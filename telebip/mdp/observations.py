@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from telebip.config import NoiseConfig
-from telebip.math import turn
+from telebip.math import columns, turn
 from telebip.sim.base import SimState
 
 LAYOUT: dict[str, int] = {
@@ -59,7 +59,7 @@ def observation(
         command,
         phase,
     )
-    return torch.cat(parts, dim=1)
+    return columns(*parts)
 
 
 def noise_amplitude(cfg: NoiseConfig) -> Tensor:

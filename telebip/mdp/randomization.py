@@ -1,13 +1,12 @@
 """Random draws: initial states, pushes, ground friction, commands, noise. All from one seeded generator per environment."""
 
-import itertools
 import math
 
 import torch
 from torch import Tensor
 
 from telebip.config import TaskConfig
-from telebip.math import quat_from_yaw
+from telebip.math import columns, quat_from_yaw, zeros
 from telebip.mdp.observations import noise_amplitude
 
 KNEES = slice(2, None, 3)
@@ -49,20 +48,17 @@ class Draws:
 
     def __init__(self, ranges: Ranges, num_envs: int, device: torch.device) -> None:
         """Allocate them on `device`."""
-        bounds = [bound for bounds in ranges.values() for bound in bounds]
-        bounds += [(0.0, 0.0)] * (-len(bounds) % 4)
-        low, high = torch.tensor(bounds, device=device).unbind(1)
+        low, high = torch.tensor([bound for bounds in ranges.values() for bound in bounds], device=device).unbind(1)
         self._middle, self._spacing = 0.5 * (low + high), (high - low) / 2**16
-        self._bits = torch.zeros(num_envs, len(bounds) // 4, dtype=torch.int64, device=device)
-        self._values = torch.zeros(num_envs, len(bounds), device=device)
-        ends = list(itertools.accumulate(len(bounds) for bounds in ranges.values()))
-        self._parts = dict(zip(ranges, self._values.tensor_split(ends, dim=1), strict=False))
+        self._values = zeros(num_envs, len(low), device=device)
+        self._bits = torch.zeros(-(-self._values.numel() // 4), dtype=torch.int64, device=device)
+        self._numbers = self._bits.view(torch.int16)[: self._values.numel()].view(self._values.T.shape).T
+        self._parts = dict(zip(ranges, self._values.split([len(bounds) for bounds in ranges.values()], dim=1), strict=True))
 
     def draw(self, generator: torch.Generator) -> None:
         """Draw all anew."""
         self._bits.random_(-(2**63), None, generator=generator)
-        self._values.copy_(self._bits.view(torch.int16))  # -32768 to 32767
-        torch.addcmul(self._middle, self._spacing, self._values, out=self._values)
+        self._values.copy_(self._numbers).mul_(self._spacing).add_(self._middle)  # the numbers are -32768 to 32767
 
     def __getitem__(self, name: str) -> Tensor:
         """Return the present numbers of a range, (num_envs, size)."""
@@ -90,10 +86,10 @@ def initial_qpos(home_qpos: Tensor, joint_offset: Tensor, heading: Tensor) -> Te
     """
     lift = -torch.minimum(*joint_offset[:, KNEES].split(1, dim=1)).clamp(max=0.0)
     x_y = home_qpos[:2].expand(len(lift), -1)
-    return torch.cat([x_y, home_qpos[2] + lift, quat_from_yaw(heading[:, 0]), home_qpos[7:] + joint_offset], dim=1)
+    return columns(x_y, home_qpos[2] + lift, quat_from_yaw(heading[:, 0]), home_qpos[7:] + joint_offset)
 
 
 def push_force(push: Tensor) -> Tensor:
     """Return horizontal forces [N], (num_envs, 2), from magnitude and direction (num_envs, 2) [N, rad]."""
     magnitude, direction = push.split(1, dim=1)
-    return magnitude * torch.cat([torch.cos(direction), torch.sin(direction)], dim=1)
+    return magnitude * columns(torch.cos(direction), torch.sin(direction))

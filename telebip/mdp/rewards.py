@@ -11,6 +11,7 @@ from torch import Tensor
 
 from telebip.config import RewardConfig
 from telebip.errors import UserError, nearest
+from telebip.math import norm
 from telebip.mdp.context import StepContext
 
 
@@ -31,7 +32,7 @@ def velocity_tracking(lin_vel_b: Tensor, command: Tensor, k_xy: float, sigma_xy:
     Returns:
         Reward [-], (num_envs,).
     """
-    error = torch.linalg.vector_norm(command[:, :2] - lin_vel_b[:, :2], dim=1)
+    error = norm(command[:, :2] - lin_vel_b[:, :2])
     return k_xy * torch.exp(-error / sigma_xy)
 
 
@@ -63,7 +64,7 @@ def action_difference(action: Tensor, last_action: Tensor, k_diff: float) -> Ten
     Returns:
         Reward [-], (num_envs,).
     """
-    return k_diff * torch.linalg.vector_norm(action - last_action, dim=1)
+    return k_diff * norm(action - last_action)
 
 
 def torque(joint_force: Tensor, force_limit: Tensor, k_tq: float) -> Tensor:
@@ -80,7 +81,7 @@ def torque(joint_force: Tensor, force_limit: Tensor, k_tq: float) -> Tensor:
     Returns:
         Reward [-], (num_envs,).
     """
-    return k_tq * torch.linalg.vector_norm(joint_force / force_limit, dim=1)
+    return k_tq * norm(joint_force / force_limit)
 
 
 def periodic_foot_force(window: Tensor, weights: Tensor, k_foot: float) -> Tensor:

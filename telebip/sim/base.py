@@ -7,6 +7,8 @@ from typing import Literal, Protocol
 import torch
 from torch import Tensor
 
+from telebip.math import zeros
+
 Backend = Literal["auto", "native", "warp"]
 
 ENGINE_FAULTS = ("engine_warning", "engine_error", "capacity")
@@ -68,7 +70,7 @@ class SimState:
     @staticmethod
     def zeros(num_envs: int, device: torch.device) -> "SimState":
         """Allocate the buffers."""
-        return SimState(*(torch.zeros(num_envs, size, device=device) for size in (13, 12, 2, 6, 6, 6)))
+        return SimState(*(zeros(num_envs, size, device=device) for size in (13, 12, 2, 6, 6, 6)))
 
 
 class Simulator(Protocol):
