@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from telebip.config import ActionConfig
+from telebip.config.schema import ActionConfig
 
 
 def action_scale(cfg: ActionConfig) -> Tensor:

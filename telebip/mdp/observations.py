@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from telebip.config import NoiseConfig
+from telebip.config.schema import NoiseConfig
 from telebip.math import columns, turn
 from telebip.sim.base import SimState
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from telebip.config import RewardConfig
+from telebip.config.schema import RewardConfig
 from telebip.errors import UserError, nearest
 from telebip.math import norm
 from telebip.mdp.context import StepContext

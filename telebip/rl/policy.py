@@ -6,7 +6,7 @@ import torch
 from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 
-from telebip.config import PpoConfig
+from telebip.config.schema import PpoConfig
 from telebip.control.policy import Policy
 from telebip.errors import UserError
 from telebip.mdp.observations import LAYOUT

@@ -18,7 +18,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from telebip.config import PpoConfig
+from telebip.config.schema import PpoConfig
 from telebip.env import TelebipEnv
 from telebip.errors import UserError
 from telebip.mdp.curriculum import ramp

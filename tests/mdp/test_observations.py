@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from worlds import quat_mul
 
-from telebip.config import NoiseConfig
+from telebip.config.schema import NoiseConfig
 from telebip.math import quat_from_yaw
 from telebip.mdp.observations import LAYOUT, heading_relative_quat, noise_amplitude, observation
 from telebip.sim.base import SimState

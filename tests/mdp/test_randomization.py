@@ -7,7 +7,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from telebip.config import EpisodeConfig, TaskConfig, load_task
+from telebip.config import TaskConfig, load_task
+from telebip.config.schema import EpisodeConfig
 from telebip.math import yaw
 from telebip.mdp.randomization import Draws, initial_qpos, push_force, ranges, uniform
 

@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from telebip.config import (
+from telebip.config.schema import (
     CmdRewardConfig,
     DiffRewardConfig,
     EnergyRewardConfig,
