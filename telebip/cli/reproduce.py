@@ -12,6 +12,7 @@ from telebip.errors import UserError, nearest
 EXAMPLES = """\
   reproduce.py                                  train and measure what is not yet, and write the report
   reproduce.py --only telebip_efficient dcm     these alone
+  reproduce.py --only telebip_flat --seeds 3    the same policy from three seeds, each with its rows in the report
   reproduce.py --shipped                        no training: measure the policies in assets/policies
   reproduce.py --quick --out /tmp/study         the same at a toy size, in a minute
 """
@@ -42,21 +43,29 @@ def main(argv: Sequence[str] | None = None) -> None:
     make_folder(out)
     for training in TRAININGS:
         if not options.only or training.name in options.only:
-            for seed in training.seeds:
+            for seed in range(1, options.seeds + 1):
                 run_dir = SHIPPED / training.name if options.shipped else _train(console, training, seed, options)
                 if run_dir is None:
                     return
-                name = training.name if seed == training.seeds[0] else f"{training.name}-seed{seed}"
-                _measure(console, out / name, training, options, subject_of(str(run_dir), training.label))
+                name, label = training.name, training.label
+                if seed > 1:
+                    name, label = f"{name}-seed{seed}", f"{label}, seed {seed}"
+                _measure(console, out / name, training, options, subject_of(str(run_dir), label))
     for baseline in BASELINES:
         if not options.only or baseline.name in options.only:
             subject = controller_subject(baseline.controller, baseline.label, baseline.overrides)
             _measure(console, out / baseline.name, baseline, options, subject)
-    results = {name: read_results(file) for name in names if (file := out / name / "results.json").is_file()}
-    seeds = [f"{t.label} ({len(t.seeds)} seed{'s' if len(t.seeds) > 1 else ''})" for t in TRAININGS if t.name in results]
+    results = {name: [read_results(file) for file in _measured(out, name)] for name in names}
+    seeds = [f"{t.label} ({n} seed{'s' if n > 1 else ''})" for t in TRAININGS if (n := len(results[t.name]))]
     text = INTRODUCTION.format(trainings=", ".join(seeds) or "none")
-    write_report(list(results.values()), out, "The study", text, references())
-    console.print(f"wrote {out}/report.md and report.html, about {len(results)} of {len(names)} walkers")
+    write_report([one for each in results.values() for one in each], out, "The study", text, references())
+    console.print(f"wrote {out}/report.md and report.html, about {sum(map(bool, results.values()))} of {len(names)} walkers")
+
+
+def _measured(out: Path, name: str) -> list[Path]:
+    """Return the results of one walker that are there, of its first seed first."""
+    files = [out / name / "results.json", *sorted(out.glob(f"{name}-seed*/results.json"))]
+    return [file for file in files if file.is_file()]
 
 
 def _train(console, training, seed: int, options: argparse.Namespace) -> Path | None:
@@ -113,7 +122,15 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--runs", default="runs/study", metavar="DIR", help="where trainings go (default: runs/study)")
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="these walkers alone")
     parser.add_argument("--shipped", action="store_true", help="measure the policies in assets/policies instead of training")
+    parser.add_argument("--seeds", type=int, default=1, metavar="N", help="trainings of each policy: seeds 1 to N (default: 1)")
     parser.add_argument("--again", action="store_true", help="measure again what has been measured")
     parser.add_argument("--quick", action="store_true", help="toy size: two iterations, four worlds")
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto, which prefers CUDA)")
-    return parser.parse(argv)
+    options = parser.parse(argv)
+    if options.seeds < 1 or (options.shipped and options.seeds > 1):
+        raise UserError(
+            "--shipped measures the one policy that there is of each; leave out --seeds"
+            if options.shipped
+            else f"--seeds must be 1 or more, got {options.seeds}"
+        )
+    return options

@@ -11,7 +11,6 @@ class Training:
     label: str  # in tables and plots
     task: str
     overrides: tuple[str, ...] = ()
-    seeds: tuple[int, ...] = (1,)
     suites: tuple[str, ...] = ("tracking", "gait", "learning")
 
 

@@ -38,6 +38,11 @@ def test_evaluate_measures_a_model_based_walker_at_the_physics_rate(tmp_path: Pa
         ([EVALUATE, "--checkpoint", "assets/policies/telebip_flat", "--num-envs", "0"], "--num-envs must be between 1"),
         ([EVALUATE, "--checkpoint", "assets/policies/telebip_flat", "--out", "/proc/x"], "cannot write to folder '/proc/x'"),
         ([REPRODUCE, "--only", "telebip_flta"], "did you mean 'telebip_flat'?"),
+        ([REPRODUCE, "--seeds", "0"], "--seeds must be 1 or more, got 0"),
+        (
+            [REPRODUCE, "--shipped", "--seeds", "2"],
+            "the one policy that there is of each; leave out --seeds",
+        ),
     ],
     ids=lambda value: " ".join(value[1:]) if isinstance(value, list) else "",
 )
@@ -59,3 +64,16 @@ def test_the_study_at_toy_size_goes_on_where_it_stopped(tmp_path: Path) -> None:
     assert again.count("trained already") == 2
     assert again.count("measured already") == 3
     assert results.stat().st_mtime_ns == written
+
+
+def test_the_study_from_two_seeds_reports_both(tmp_path: Path) -> None:
+    where = ("--quick", "--device", "cpu", "--out", str(tmp_path / "out"), "--runs", str(tmp_path / "runs"))
+    ran(REPRODUCE, *where, "--only", "period_06", "--seeds", "2")
+    assert {path.name for path in (tmp_path / "runs").iterdir()} == {"period_06-seed1", "period_06-seed2"}
+    report = (tmp_path / "out" / "report.md").read_text()
+    assert "RL, period 0.6 s (2 seeds)" in report
+    assert report.count("| RL, period 0.6 s, seed 2 |") == report.count("| RL, period 0.6 s |") > 0
+    first, second = (
+        json.loads((tmp_path / "out" / name / "results.json").read_text()) for name in ("period_06", "period_06-seed2")
+    )
+    assert first["fingerprint"] != second["fingerprint"]
