@@ -30,6 +30,7 @@ MODEL_FIELDS = ("geom_friction",)
 MEMORY = (
     *("episode_length_buf", "last_action", "command", "target_command", "reference_heading", "push_wrench_w"),
     *("_push_timer", "_push_time_left", "_command_timer", "_foot_window", "_base_lin_vel_b", "_noise", "num_steps"),
+    *("_command_is_fixed", "_push_share", "_energy_share"),
 )
 """Buffers of the environment that outlast a step; all else is computed anew in each."""
 
@@ -267,9 +268,11 @@ class TelebipEnv(VecEnv):
         """Go on from another environment's `state_dict`.
 
         Raises:
-            ValueError: it has other worlds: of another number, robot, engine, or length of the gait's period.
+            ValueError: it has other worlds: of another number, robot, engine, kind of device, or length of the gait's period.
         """
         live = self._live
+        if state["generator"].shape != self.generator.get_state().shape:
+            raise ValueError("'generator' is another kind of device's")
         for part, values in live.items():
             for name, value in values.items():
                 found = state[part].get(name)

@@ -1,4 +1,4 @@
-"""Writing files that are complete, or not there at all."""
+"""Files that are complete or not there at all, and questions about files that always have an answer."""
 
 import os
 from pathlib import Path
@@ -26,3 +26,19 @@ def write_atomically(path: Path, content: bytes) -> None:
             os.fsync(folder)
         finally:
             os.close(folder)
+
+
+def is_file(path: Path) -> bool:
+    """Whether `path` is a file; not, too, where its name is too long, holds what no name can, or may not be looked up."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def is_folder(path: Path) -> bool:
+    """Whether `path` is a folder; as `is_file`."""
+    try:
+        return path.is_dir()
+    except (OSError, ValueError):
+        return False

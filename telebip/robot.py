@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from telebip import ROOT
 from telebip.errors import UserError
+from telebip.files import is_file
 
 JOINTS = ("right_hip_roll", "right_hip_pitch", "right_knee", "left_hip_roll", "left_hip_pitch", "left_knee")
 """Joints and their actuators, in the order of actions and observations: right leg first, as the phase signals (p_r, p_l)."""
@@ -53,7 +54,7 @@ def load_robot(path: str | Path) -> Robot:
     Raises:
         UserError: the file is missing or is no valid MJCF, or something is missing or of another kind; the message says what.
     """
-    file = next((p for p in (Path(path), ROOT / path) if p.is_file()), None)
+    file = next((p for p in (Path(path), ROOT / path) if is_file(p)), None)
     if file is None:
         raise UserError(f"robot file '{path}' does not exist")
     try:

@@ -181,6 +181,16 @@ def test_only_the_first_fault_of_a_kind_is_kept(make_env: MakeEnv, tmp_path: Pat
     assert save_fault(tmp_path, "non_finite_action", record | {"step": torch.tensor(9)}, "x", env).read_bytes() == first
 
 
+def test_faults_in_and_out_of_inference_mode_are_kept(make_env: MakeEnv) -> None:
+    env = make_env(num_envs=NUM_ENVS)
+    zeros = torch.zeros(NUM_ENVS, 6)
+    with torch.inference_mode():
+        env.step(torch.full_like(zeros, math.nan))
+    env.sim.reset(torch.ones(NUM_ENVS, dtype=torch.bool), env.sim.state.qpos * math.nan, env.sim.state.qvel)
+    env.step(zeros)
+    assert env.take_faults().keys() >= {"non_finite_action", "non_finite_state"}
+
+
 def test_noting_faults_waits_for_nothing(make_env: MakeEnv) -> None:
     env = make_env(num_envs=NUM_ENVS)
     with HostReads() as reads:

@@ -59,18 +59,19 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def controller_subject(name: str, label: str | None, overrides: Sequence[str] = ()):
     """Return a model-based walker as a subject of the evaluator, with `overrides` of its parameters and of the task."""
-    from telebip.control.config import split_overrides
+    from telebip.control.config import load_controller, split_overrides
     from telebip.control.factory import make_controller
     from telebip.eval.suites import Subject
 
     task, own = split_overrides(overrides)
+    config = load_task("telebip_flat", task)
     return Subject(
         label=label or name,
-        config=load_task("telebip_flat", task),
+        config=config,
         make_policy=lambda env: make_controller(name, env, own),
         limited=False,
         source=" ".join(["evaluate.py --controller", name, *overrides]),
-        fingerprint=" ".join([name, *overrides]),
+        fingerprint=sha256(repr((name, load_controller(name, own), config.sim, config.action)).encode()).hexdigest()[:16],
     )
 
 

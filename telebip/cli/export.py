@@ -1,9 +1,11 @@
 """`export.py`: export a policy to ONNX."""
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
 from telebip.cli.common import Parser, open_checkpoint
+from telebip.config import load_task
 from telebip.errors import UserError
 
 EXAMPLES = """\
@@ -22,6 +24,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         "--checkpoint", metavar="PATH_OR_RUN", required=True, help="a checkpoint, or a run folder for its newest"
     )
     parser.add_argument("--out", metavar="FILE.onnx", default="policy.onnx", help="file to write (default: policy.onnx)")
+    parser.add_argument("overrides", nargs="*", metavar="key.path=value", help="override any field of the task, as sim.robot")
     options = parser.parse(argv)
     out = Path(options.out)
     if out.suffix != ".onnx":
@@ -33,6 +36,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     with console.status("loading torch"):
         from telebip.rl.export import export
     checkpoint = open_checkpoint(options.checkpoint)
+    checkpoint = dataclasses.replace(checkpoint, config=load_task(checkpoint.config, options.overrides))
     with console.status("exporting"):
         difference = export(checkpoint, out, SAMPLES)
     console.print(f"wrote {out}: the policy of {checkpoint.path}, after {checkpoint.iteration} iterations of {checkpoint.task}")

@@ -30,7 +30,7 @@ EXAMPLES = """\
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Parse arguments and draw."""
-    parser = Parser("Make the pictures of README and docs anew, from the shipped policy.", EXAMPLES)
+    parser = Parser("Make the pictures of walkers in README and docs anew, from the shipped policy.", EXAMPLES)
     parser.add_argument("--checkpoint", metavar="PATH_OR_RUN", default=str(ROOT / "assets" / "policies" / "telebip_efficient"))
     parser.add_argument("--command", nargs=3, type=float, metavar=("VX", "VY", "WZ"), default=(0.7, 0.0, 0.0))
     parser.add_argument("--out", metavar="DIR", type=Path, default=ROOT / "docs" / "images", help="default: docs/images")

@@ -14,7 +14,7 @@ EXAMPLES = """\
   reproduce.py --only telebip_efficient dcm     these alone
   reproduce.py --only telebip_flat --seeds 3    the same policy from three seeds, each with its rows in the report
   reproduce.py --shipped                        no training: measure the policies in assets/policies
-  reproduce.py --quick --out /tmp/study         the same at a toy size, in a minute
+  reproduce.py --quick                          the same at a toy size, in a minute, apart from the real one
 """
 
 QUICK_TRAINING = ("num_envs=64", "ppo.max_iterations=2", "ppo.hidden_dims=[32,32]")
@@ -87,18 +87,16 @@ def _train(console, training, seed: int, options: argparse.Namespace) -> Path | 
 
 
 def _measure(console, out: Path, walker, options: argparse.Namespace, subject) -> None:
-    """Measure one walker, unless complete results of the same policy or parameters are there."""
+    """Measure one walker, unless complete results of the same policy or parameters, measured in the same way, are there."""
     from telebip.eval.report import make_folder, read_results, write_results
-    from telebip.eval.suites import Protocol, evaluate
+    from telebip.eval.suites import Protocol, evaluate, is_current
     from telebip.robot import load_robot
 
     protocol = _quick_protocol() if options.quick else Protocol(device=resolve_device(options.device))
     file = out / "results.json"
-    if file.is_file() and not options.again:
-        done = read_results(file)
-        if set(walker.suites) <= done.keys() and done["fingerprint"] == subject.fingerprint:
-            console.print(f"{walker.name}: measured already")
-            return
+    if file.is_file() and not options.again and is_current(read_results(file), subject, walker.suites, protocol):
+        console.print(f"{walker.name}: measured already")
+        return
     make_folder(out)
     with progress_bar(console) as show:
         results = evaluate(subject, load_robot(subject.config.sim.robot), walker.suites, protocol, show)
@@ -117,9 +115,9 @@ def _quick_protocol():
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = Parser("Train and measure every policy of the study and both model-based walkers, and report.", EXAMPLES)
     parser.add_argument(
-        "--out", default="docs/results", metavar="DIR", help="where results and report go (default: docs/results)"
+        "--out", metavar="DIR", help="where results and report go (default: docs/results; quick: runs/study_quick/results)"
     )
-    parser.add_argument("--runs", default="runs/study", metavar="DIR", help="where trainings go (default: runs/study)")
+    parser.add_argument("--runs", metavar="DIR", help="where trainings go (default: runs/study; quick: runs/study_quick)")
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="these walkers alone")
     parser.add_argument("--shipped", action="store_true", help="measure the policies in assets/policies instead of training")
     parser.add_argument("--seeds", type=int, default=1, metavar="N", help="trainings of each policy: seeds 1 to N (default: 1)")
@@ -127,6 +125,8 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--quick", action="store_true", help="toy size: two iterations, four worlds")
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto, which prefers CUDA)")
     options = parser.parse(argv)
+    options.out = options.out or ("runs/study_quick/results" if options.quick else "docs/results")
+    options.runs = options.runs or ("runs/study_quick" if options.quick else "runs/study")
     if options.seeds < 1 or (options.shipped and options.seeds > 1):
         raise UserError(
             "--shipped measures the one policy that there is of each; leave out --seeds"

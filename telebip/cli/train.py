@@ -85,6 +85,7 @@ def train(
     console = Console(highlight=False, soft_wrap=True, quiet=not ranks.is_main)
     with console.status("loading torch and the physics engine"):
         from telebip.env import TelebipEnv
+        from telebip.rl.checkpoint import set_aside_newer
         from telebip.rl.process import prepare_cpu
         from telebip.rl.run import create_run_dir, describe_run, exclusive, require_space
         from telebip.rl.train import Trainer
@@ -113,6 +114,8 @@ def train(
             return True
         engine = env.sim.backend
         if ranks.is_main:
+            for file in set_aside_newer(run_dir, trainer.iteration):
+                console.print(f"note: {file.name} is from after the checkpoint to go on from, and is in {file.parent} now")
             require_space(run_dir, trainer.checkpoint_bytes(), config.ppo.keep_checkpoints)
             describe_run(run_dir, config, str(device), engine, ranks.size)
         arithmetic = "bfloat16" if trainer.learner.use_mixed_precision else "float32"

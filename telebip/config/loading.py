@@ -14,6 +14,7 @@ from omegaconf.errors import OmegaConfBaseException
 from telebip import ROOT
 from telebip.config.schema import TaskConfig
 from telebip.errors import UserError, nearest
+from telebip.files import is_file
 
 CONFIGS = ROOT / "configs"
 
@@ -94,20 +95,17 @@ def _layers(task: str, named_at: str = "", below: tuple[Path, ...] = ()) -> list
 def _from_its_folder(leaf: Leaf, file: Path) -> Leaf:
     """Let a task file name the robot that lies beside it, whatever the working directory."""
     key, value, where = leaf
-    if key == "sim.robot" and isinstance(value, str) and (file.parent / value).is_file():
+    if key == "sim.robot" and isinstance(value, str) and is_file(file.parent / value):
         return key, str((file.parent / value).resolve()), where
     return leaf
 
 
 def _task_path(task: str, named_at: str) -> Path:
-    is_file = task.endswith((".yaml", ".yml"))
-    path = Path(task) if is_file else CONFIGS / f"{task}.yaml"
-    try:
-        if path.is_file():
-            return path
-    except (OSError, ValueError):
-        pass  # no such file: the name is too long, or holds what no name can hold
-    if is_file:
+    names_file = task.endswith((".yaml", ".yml"))
+    path = Path(task) if names_file else CONFIGS / f"{task}.yaml"
+    if is_file(path):
+        return path
+    if names_file:
         raise UserError(f"{named_at}task file '{task}' does not exist")
     raise UserError(f"{named_at}unknown task '{task}'; {nearest(task, task_names())}")
 

@@ -18,8 +18,6 @@ PUSH: dict[str, dict[str, tuple[float, float, float]]] = {
 }
 """Seconds of walking to the largest push forward, backward and to the side [N]."""
 
-SAMPLES_TO_CONVERGE = 8e6
-
 
 def as_results(label: str) -> dict[str, Any]:
     """Return the article's numbers for one of its walkers in the form of the evaluator's results, with what it reports."""

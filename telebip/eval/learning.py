@@ -21,7 +21,7 @@ def learning_curve(run_dir: Path, points: int = 200) -> dict[str, Any] | None:
 
     Returns:
         `samples` and one list for each of `COLUMNS`; `samples_to_95_length` and `samples_to_95_return`. None if the folder has
-        no learning curve (a policy that was copied out of its run).
+        no learning curve (a policy that was copied out of its run), or an empty one.
 
     Raises:
         UserError: the file is damaged.
@@ -34,6 +34,8 @@ def learning_curve(run_dir: Path, points: int = 200) -> dict[str, Any] | None:
         curves = {name: [row[column] for row in rows] for name, column in COLUMNS.items()}
     except KeyError as error:
         raise UserError(f"{run_dir / FILE} is damaged: it has no column {error}") from error
+    if not rows:
+        return None
     every = max(1, -(-len(rows) // points))
     return {
         "samples": samples[::every],

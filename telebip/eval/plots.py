@@ -54,8 +54,8 @@ def speed(results: Results) -> Figure:
         figure, axes = plt.subplots(figsize=(7.2, 2.8))
         commands = [name for name in series if name != "time_s"]
         for i, name in enumerate(commands):
-            axes.plot(series["time_s"], series[name], color=COLORS[i], lw=1.4, label=f"{float(name):g} m/s")
-            axes.axhline(float(name), color=COLORS[i], lw=0.9, ls=(0, (4, 3)))
+            axes.plot(series["time_s"], series[name], color=COLORS[i % len(COLORS)], lw=1.4, label=f"{float(name):g} m/s")
+            axes.axhline(float(name), color=COLORS[i % len(COLORS)], lw=0.9, ls=(0, (4, 3)))
         axes.axvspan(0, results["protocol"]["skip_s"], color="#f3f4f6", zorder=0)
         axes.set(xlabel="time [s]", ylabel="speed [m/s]", title=f"{results['label']}: speed, and what was commanded (dashed)")
         axes.set_xlim(0, series["time_s"][-1])

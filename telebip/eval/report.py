@@ -154,7 +154,7 @@ def _tables(all_results: Sequence[Results]) -> list[Table]:
 
 
 def _tracking_cells(row: dict[str, Any]) -> list[str]:
-    interval = f" ± {row['ci95_mps']:.3f}" if row.get("ci95_mps") else ""
+    interval = f" ± {row['ci95_mps']:.3f}" if math.isfinite(row.get("ci95_mps") or math.nan) else ""
     return [
         number(row["command_mps"], 2),
         number(row["mean_speed_mps"], 3) + interval,

@@ -6,7 +6,7 @@
 import dataclasses
 import platform
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -91,13 +91,7 @@ def evaluate(
         "date": datetime.now().astimezone().isoformat(timespec="seconds"),
         "machine": f"{platform.machine()}, {protocol.device}",
         "engine": choose_backend(protocol.backend, protocol.device),
-        "protocol": {
-            "worlds": protocol.worlds,
-            "duration_s": protocol.duration,
-            "skip_s": protocol.skip,
-            "seed": subject.config.seed,
-            "gait_period_s": subject.config.gait.period,
-        },
+        "protocol": describe_protocol(subject, protocol),
     }
     if "tracking" in suites or "gait" in suites:
         walks = _walk(subject, robot, protocol, progress)
@@ -112,6 +106,35 @@ def evaluate(
     if "learning" in suites:
         results["learning"] = learning_curve(subject.run_dir) if subject.run_dir else None
     return results
+
+
+def describe_protocol(subject: Subject, protocol: Protocol) -> dict[str, Any]:
+    """Return how the walking suites are run, as results say it."""
+    return {
+        "worlds": protocol.worlds,
+        "duration_s": protocol.duration,
+        "skip_s": protocol.skip,
+        "seed": subject.config.seed,
+        "gait_period_s": subject.config.gait.period,
+    }
+
+
+def push_protocol_of(subject: Subject, protocol: Protocol) -> PushProtocol:
+    """Return how the push suite is run: at a speed that the policy was trained on."""
+    low, high = subject.config.command.lin_vel_x
+    command = float(np.clip(protocol.push.command, low, high)) if subject.limited else protocol.push.command
+    return dataclasses.replace(protocol.push, command=command)
+
+
+def is_current(results: dict[str, Any], subject: Subject, suites: Sequence[str], protocol: Protocol) -> bool:
+    """Whether results from a file are what `evaluate` would measure again: all of the suites, of the same, in the same way."""
+    push = push_protocol_of(subject, protocol)
+    return (
+        set(suites) <= results.keys()
+        and results["fingerprint"] == subject.fingerprint
+        and results["protocol"] == describe_protocol(subject, protocol)
+        and ("push" not in suites or results["push"]["protocol"] == {**asdict(push), "horizons": list(push.horizons)})
+    )
 
 
 def commands_of(subject: Subject, protocol: Protocol) -> tuple[float, ...]:
@@ -135,7 +158,7 @@ def _walk(subject: Subject, robot: Robot, protocol: Protocol, progress: Progress
     env = make_env(subject, robot, protocol, len(commands) * protocol.worlds, protocol.duration)
     forward = torch.tensor(commands, device=env.device).repeat_interleave(protocol.worlds)
     env.set_commands(torch.nn.functional.pad(forward[:, None], (0, 2)))
-    steps = round(protocol.duration / env.step_dt)
+    steps = max(1, round(protocol.duration / env.step_dt))
     rollout = roll_out(env, subject.make_policy(env), steps, lambda step: progress("walking", step, steps))
     n = protocol.worlds
     return {command: rollout.select(slice(i * n, (i + 1) * n)) for i, command in enumerate(commands)}
@@ -163,18 +186,16 @@ def _gait(rollout: Rollout, command: float, skip: float, clock: float) -> dict[s
     speed = float(heading_velocity(kept.qpos, kept.qvel)[..., 0].mean(dtype=float))
     knees = kept.qpos[..., 7:][..., [2, 5]]
     summary = summarise_gait(kept.foot_force, knees, speed, rollout.weight, rollout.step_dt, clock)
-    return {"command_mps": command, **{name: round(value, 5) for name, value in dataclasses.asdict(summary).items()}}
+    return {"command_mps": command, **{name: round(value, 5) for name, value in asdict(summary).items()}}
 
 
 def _push(subject: Subject, robot: Robot, protocol: Protocol, progress: Progress) -> dict[str, Any]:
-    low, high = subject.config.command.lin_vel_x
-    command = float(np.clip(protocol.push.command, low, high)) if subject.limited else protocol.push.command
-    push = dataclasses.replace(protocol.push, command=command)
+    push = push_protocol_of(subject, protocol)
     env = make_env(subject, robot, protocol, push.num_envs, push.seconds)
     total = round(push.seconds / env.step_dt)
     name = f"pushing {push.num_envs} worlds"
     survival = push_trial(env, subject.make_policy(env), push, lambda step: progress(name, step, total))
-    return {"protocol": dataclasses.asdict(push), **push_limits(survival, push, robot.weight)}
+    return {"protocol": asdict(push), **push_limits(survival, push, robot.weight)}
 
 
 def _speed_series(walks: dict[float, Rollout], every: float = 0.1) -> dict[str, Any]:

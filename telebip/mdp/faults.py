@@ -41,7 +41,8 @@ class FaultRecorder:
         for name, value in {"step": step.expand_as(self._world), "world": self._world, **world}.items():
             rows = value.index_select(0, first)
             if name not in self._records:
-                self._records[name] = torch.zeros_like(rows)
+                with torch.inference_mode(False):  # it outlives the caller's mode
+                    self._records[name] = torch.zeros_like(rows)
             kept = self._records[name]
             kept.copy_(torch.where(new.view(-1, *[1] * (rows.dim() - 1)), rows, kept))
         self._seen |= new

@@ -92,6 +92,7 @@ class Ladder:
         self._stock = StockTrainer(env, "", Path()) if stock_threads else None
         if self._stock:
             self._stock.learner.train_mode()
+        self._restore(self._trainer)
         with torch.inference_mode():
             obs = self._trainer.view.get_observations()
             for _ in range(round(WARM_UP / env.step_dt)):
@@ -110,6 +111,7 @@ class Ladder:
     def round(self) -> Seconds:
         """Measure every rung once, and walk on."""
         env, learner = self.env, self._trainer.learner
+        self._restore(self._trainer)
         start = env.state_dict()
         seed = torch.seed()
         with recorded(env) as (actions, calls), torch.inference_mode():
@@ -138,7 +140,7 @@ class Ladder:
     def _iteration(self, trainer: Trainer) -> Seconds:
         """Run one training iteration from the policy's weights; return how long collecting and learning took."""
         learner = trainer.learner
-        learner.load(copy.deepcopy(self._weights), load_cfg=None, strict=True)
+        self._restore(trainer)
         with torch.inference_mode():
             obs = trainer.view.get_observations()
 
@@ -154,6 +156,10 @@ class Ladder:
             learner.update()
 
         return {"collect": collect_seconds, "learn": self._timed(learn)}
+
+    def _restore(self, trainer: Trainer) -> None:
+        """Give a learner the weights of the policy that walks, as before any update."""
+        trainer.learner.load(copy.deepcopy(self._weights), load_cfg=None, strict=True)
 
     def _timed(self, function: Callable[[], Any]) -> float:
         """Return how long a call took, from an idle device to an idle device [s]."""

@@ -12,6 +12,7 @@ from telebip import ROOT
 from telebip.archive import DamagedArchiveError, load_archive, save_archive
 from telebip.config import TaskConfig, parse_config, to_yaml
 from telebip.errors import UserError
+from telebip.files import is_file, is_folder
 from telebip.mdp.observations import LAYOUT
 from telebip.rl.onnx import OnnxPolicy
 from telebip.robot import JOINTS, Robot
@@ -76,6 +77,25 @@ def prune_checkpoints(run_dir: Path, keep: int) -> None:
         file.unlink(missing_ok=True)
 
 
+def set_aside_newer(run_dir: Path, iteration: int) -> list[Path]:
+    """Move a run folder's checkpoints from after `iteration` to its folder `set_aside`, and return where they are now.
+
+    A run that goes on from an earlier checkpoint is another one from there on; "the newest" must mean its own.
+
+    Raises:
+        UserError: they cannot be moved.
+    """
+    moved = []
+    try:
+        for file in _numbered(run_dir):
+            if int(file.stem.removeprefix("model_")) > iteration:
+                (run_dir / "set_aside").mkdir(exist_ok=True)
+                moved.append(file.replace(run_dir / "set_aside" / file.name))
+    except OSError as error:
+        raise UserError(f"cannot write to run folder '{run_dir}': {error.strerror or error}") from error
+    return moved
+
+
 def load_checkpoint(path: str | Path) -> Checkpoint:
     """Load a checkpoint file (.pt or .onnx), or the newest one of a run folder that is not damaged.
 
@@ -134,10 +154,10 @@ def robot_properties(robot: Robot) -> dict[str, list[float]]:
 
 def _find(given: Path) -> list[Path]:
     """Return the files that a path stands for, the best one first."""
-    path = next((p for p in (given, ROOT / given, POLICIES / given) if p.exists()), given)
-    if path.is_file():
+    path = next((p for p in (given, ROOT / given, POLICIES / given) if is_file(p) or is_folder(p)), given)
+    if is_file(path):
         return [path]
-    if not path.exists():
+    if not is_folder(path):
         shipped = ", ".join(sorted(folder.name for folder in POLICIES.glob("*")))
         raise UserError(f"checkpoint '{path}' does not exist; policies that come with telebip: {shipped}")
     if numbered := _numbered(path):

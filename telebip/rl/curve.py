@@ -29,7 +29,7 @@ class CurveWriter:
             self._columns += [name for name in row if name not in self._columns]
             self._write(rows)
         with self._path.open("a", newline="", encoding="utf-8") as file:
-            csv.writer(file).writerow(f"{row.get(name, math.nan):.6g}" for name in self._columns)
+            csv.writer(file).writerow(_text(row.get(name, math.nan)) for name in self._columns)
 
     def _write(self, rows: Sequence[Mapping[str, float]]) -> None:
         """Write the file anew."""
@@ -38,8 +38,13 @@ class CurveWriter:
         writer = csv.writer(text)
         if self._columns:
             writer.writerow(self._columns)
-        writer.writerows([f"{row.get(name, math.nan):.6g}" for name in self._columns] for row in rows)
+        writer.writerows([_text(row.get(name, math.nan)) for name in self._columns] for row in rows)
         write_atomically(self._path, text.getvalue().encode())
+
+
+def _text(value: float) -> str:
+    """Return a number with six digits, or a whole one, such as `samples`, with all of them."""
+    return f"{value:.0f}" if float(value).is_integer() else f"{value:.6g}"
 
 
 def read_curve(run_dir: Path) -> list[dict[str, float]]:

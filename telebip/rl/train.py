@@ -88,6 +88,7 @@ class Trainer:
             raise UserError(
                 f"checkpoint '{checkpoint.path}' cannot be resumed: {' '.join(str(error).split())[:120]}"
             ) from error
+        self._heed_learning_rate(checkpoint.config.ppo)
         self.iteration, self.samples = checkpoint.iteration, checkpoint.samples
         if len(checkpoint.training) != self.ranks.size:
             return f"the checkpoint has worlds of {len(checkpoint.training)} processes, this run has {self.ranks.size}"
@@ -96,6 +97,14 @@ class Trainer:
         except ValueError as error:
             return f"the checkpoint's worlds are others: {error}"
         return ""
+
+    def _heed_learning_rate(self, before: PpoConfig) -> None:
+        """Learn at the configured rate where it, or its schedule, is not what it was before; else at the checkpoint's."""
+        ppo = self.env.cfg.ppo
+        if (ppo.learning_rate, ppo.schedule) != (before.learning_rate, before.schedule):
+            self.learner.learning_rate = ppo.learning_rate
+            for group in self.learner.optimizer.param_groups:
+                group["lr"] = ppo.learning_rate
 
     def learn(self, stop: Callable[[], bool], report: Callable[[dict[str, float]], None]) -> None:
         """Train up to the configured total of iterations, or until `stop()` holds, and save a checkpoint at the end.

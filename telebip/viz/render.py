@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telebip.errors import UserError
-from telebip.robot import FEET, Robot
+from telebip.robot import FOOT_SENSORS, Robot
 from telebip.viz.opengl import how_to_get_opengl
 from telebip.viz.scene import Color
 
@@ -37,6 +37,7 @@ class Renderer:
         self.model.vis.global_.offwidth, self.model.vis.global_.offheight = size
         self.model.stat.extent, self.model.vis.quality.shadowsize = extent, shadow_size
         self.size = size
+        self._foot_sites = [int(self.model.sensor(sensor).objid[0]) for sensor in FOOT_SENSORS]
         self.camera = mujoco.MjvCamera()
         self._option = mujoco.MjvOption()
         try:
@@ -68,7 +69,7 @@ class Renderer:
         for i, qpos in enumerate(poses):
             self.data.qpos[:] = qpos
             mujoco.mj_forward(self.model, self.data)
-            feet.append([self.data.body(foot).xpos.copy() for foot in FEET])
+            feet.append(self.data.site_xpos[self._foot_sites])  # a copy
             if i == 0:
                 self._renderer.update_scene(self.data, self.camera, self._option)
             else:

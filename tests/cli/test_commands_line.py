@@ -42,6 +42,9 @@ def refusal(script: str, *arguments: str) -> str:
     return lines[0]
 
 
+LONG = 300 * "a"
+
+
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
@@ -51,6 +54,8 @@ def refusal(script: str, *arguments: str) -> str:
         ([TRAIN, "--task", "telebip_flat", "--num-envs", "0"], ["num_envs must be >= 1", "got 0"]),
         ([TRAIN, "--task", "telebip_flat", "--num-env", "8"], ["--num-env", "did you mean '--num-envs'?"]),
         ([TRAIN], ["--task", "telebip_flat"]),
+        ([TRAIN, "--task", "telebip_flat", f"sim.robot={LONG}"], ["robot file", "does not exist"]),
+        ([PLAY, "--checkpoint", LONG], ["checkpoint", "does not exist"]),
         ([PLAY, "--agent", "zero", "--duration", "-1"], ["--duration", "-1"]),
         ([PLAY, "--controller", "alp"], ["--controller", "'alp'", "'alip', 'dcm'"]),
         ([PLAY, "--controller", "dcm", "control.step_tim=1"], ["did you mean 'control.step_time'?"]),

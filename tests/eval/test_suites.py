@@ -10,14 +10,15 @@ import pytest
 import torch
 
 from telebip import ROOT
-from telebip.cli.evaluate import references, subject_of
+from telebip.cli.evaluate import controller_subject, references, subject_of
+from telebip.config import load_task
 from telebip.control.policy import Stateless
 from telebip.errors import UserError
 from telebip.eval import plots
 from telebip.eval.learning import learning_curve, samples_to
 from telebip.eval.push import PushProtocol
 from telebip.eval.report import read_results, write_report, write_results
-from telebip.eval.suites import SUITES, Protocol, Subject, check_suites, commands_of, evaluate
+from telebip.eval.suites import SUITES, Protocol, Subject, check_suites, commands_of, evaluate, is_current
 from telebip.robot import Robot
 
 POLICY = "assets/policies/telebip_flat"
@@ -89,6 +90,37 @@ def test_results_are_json_and_come_back(results: dict[str, Any], tmp_path: Path)
     assert back["tracking"] == results["tracking"]
 
 
+def test_results_are_current_for_the_same_subject_measured_in_the_same_way(
+    results: dict[str, Any], subject: Subject, tmp_path: Path
+) -> None:
+    write_results(results, tmp_path)
+    back = read_results(tmp_path / "results.json")
+    assert is_current(back, subject, SUITES, PROTOCOL)
+    assert not is_current(back, subject, SUITES, dataclasses.replace(PROTOCOL, worlds=5))
+    assert not is_current(back, subject, SUITES, dataclasses.replace(PROTOCOL, push=PushProtocol()))
+    assert not is_current(back, dataclasses.replace(subject, fingerprint="of another"), SUITES, PROTOCOL)
+    assert not is_current({key: value for key, value in back.items() if key != "gait"}, subject, SUITES, PROTOCOL)
+
+
+def test_a_controller_is_told_by_its_parameters() -> None:
+    own, same, other = (controller_subject("dcm", None, overrides) for overrides in ((), (), ("control.step_time=0.3",)))
+    assert own.fingerprint == same.fingerprint != other.fingerprint
+
+
+def test_the_report_takes_any_number_of_commands_and_a_single_world(results: dict[str, Any], tmp_path: Path) -> None:
+    speed = results["series"]["speed"]
+    many = {"time_s": speed["time_s"], **{f"{0.05 * i:g}": speed["0.7"] for i in range(12)}}
+    alone = [row | {"ci95_mps": float("nan")} for row in results["tracking"]]
+    write_report([results | {"series": results["series"] | {"speed": many}, "tracking": alone}], tmp_path, "Many")
+    assert "nan" not in (tmp_path / "report.md").read_text()
+
+
+def test_a_walk_has_a_step_at_least(subject: Subject, robot: Robot) -> None:
+    slow = dataclasses.replace(subject, config=load_task(subject.config, ["sim.decimation=1000"]))
+    rows = evaluate(slow, robot, ("tracking",), dataclasses.replace(PROTOCOL, worlds=1, duration=1.0, skip=0.0))["tracking"]
+    assert len(rows) == 3
+
+
 def test_the_report_shows_the_numbers_beside_the_articles_in_one_file(results: dict[str, Any], tmp_path: Path) -> None:
     write_report([results], tmp_path, "How <it> walks", "First.\n\nSecond.", references())
     markdown, page = ((tmp_path / f"report.{suffix}").read_text() for suffix in ("md", "html"))
@@ -156,6 +188,8 @@ def test_a_learning_curve_is_thinned_and_a_damaged_one_named(tmp_path: Path) -> 
     (tmp_path / "learning.csv").write_text("samples,train/episode_length\n1000,many\n")
     with pytest.raises(UserError, match=r"learning\.csv is damaged at line 2: could not convert string to float: 'many'"):
         learning_curve(tmp_path)
+    (tmp_path / "learning.csv").write_text(columns + "\n")
+    assert learning_curve(tmp_path) is None
     (tmp_path / "learning.csv").write_text("samples,train/episode_length\n1000,500\n")
     with pytest.raises(UserError, match=r"learning\.csv is damaged: it has no column 'train/episode_return'"):
         learning_curve(tmp_path)

@@ -4,9 +4,14 @@ from itertools import pairwise
 
 import pytest
 import torch
+from torch import Tensor
 from worlds import MakeEnv, put_low, random_actions
 
-from telebip.rl.benchmark import allocated_bytes, recorded, summary
+from telebip.config import load_task
+from telebip.env import TelebipEnv
+from telebip.rl.benchmark import Ladder, allocated_bytes, recorded, summary
+from telebip.rl.checkpoint import load_checkpoint
+from telebip.robot import Robot
 
 
 def test_a_recorded_walk_can_be_gone_over_again(make_env: MakeEnv) -> None:
@@ -28,6 +33,25 @@ def test_a_recorded_walk_can_be_gone_over_again(make_env: MakeEnv) -> None:
         env.sim.advance()
         for name, value in env.sim.memory.items():
             assert torch.equal(value[others], following.memory[name][others]), name
+
+
+def test_every_rung_takes_the_same_actions(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    walked: list[Tensor] = []
+    step = TelebipEnv.step
+
+    def noted(env: TelebipEnv, actions: Tensor):
+        walked.append(actions.clone())
+        return step(env, actions)
+
+    monkeypatch.setattr(TelebipEnv, "step", noted)
+    config = load_task("telebip_flat", ["num_envs=8", "ppo.num_steps_per_env=10", "ppo.learning_rate=0.01"])
+    ladder = Ladder(config, robot, torch.device("cpu"), "native", load_checkpoint("telebip_flat"), stock_threads=1)
+    for _ in range(2):
+        walked.clear()
+        ladder.round()
+        recording, env, stock, collect = (torch.stack(walked[i : i + 10]) for i in range(0, 40, 10))
+        for rung in (env, stock, collect):
+            assert torch.equal(rung, recording)
 
 
 def test_the_summary_is_made_of_medians_over_the_rounds() -> None:

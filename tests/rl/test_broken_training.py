@@ -128,6 +128,28 @@ def test_other_worlds_start_anew_and_that_is_said(robot: Robot, tmp_path: Path, 
     assert other.trainer.iteration == 2
 
 
+def test_worlds_of_another_kind_of_device_start_anew(robot: Robot, tmp_path: Path) -> None:
+    Training(robot, tmp_path, "ppo.max_iterations=1").learn()
+    checkpoint = load_checkpoint(tmp_path)
+    checkpoint.training[0]["env"]["generator"] = torch.zeros(16, dtype=torch.uint8)  # as CUDA's
+    other = Training(robot, tmp_path, "ppo.max_iterations=2")
+    before = other.env.state_dict()["sim"]["qpos"]
+    assert "'generator' is another kind of device's" in other.trainer.resume(checkpoint)
+    assert torch.equal(other.env.state_dict()["sim"]["qpos"], before)
+    other.learn()
+
+
+def test_a_copied_state_keeps_its_command_and_its_place_in_the_curriculum(robot: Robot) -> None:
+    first, second = (TelebipEnv(load_task("telebip_efficient", ["num_envs=2"]), robot, "cpu", "native") for _ in range(2))
+    first.set_command(0.7, 0.0, 0.0)
+    first.set_progress(6.5e6)
+    second.load_state_dict(first.state_dict())
+    for _ in range(2):
+        ours, theirs = first.step(torch.zeros(2, 6)), second.step(torch.zeros(2, 6))
+        assert torch.equal(ours[0]["policy"], theirs[0]["policy"])
+        assert torch.equal(ours[1], theirs[1])
+
+
 @pytest.mark.parametrize("backend", ["native", "warp"])
 def test_a_copied_state_goes_on_bit_for_bit(robot: Robot, backend: Backend) -> None:
     config = load_task("telebip_flat", ["num_envs=8", "episode.length=0.3", "disturbance.push.interval=[0.1,0.2]"])

@@ -201,6 +201,18 @@ def test_one_interrupt_finishes_the_iteration_and_saves_it(tmp_path: Path) -> No
     assert len(curve(folder)) == 1 + load_checkpoint(folder).iteration
 
 
+def test_going_on_from_an_earlier_checkpoint_sets_the_later_ones_aside(tmp_path: Path) -> None:
+    Training(tmp_path, *new(tmp_path, 8)).finish()
+    folder = run_dir(tmp_path)
+    output = Training(tmp_path, *resumed(folder / "model_4.pt", 5), "ppo.keep_checkpoints=1").finish()
+    for name in ("model_6.pt", "model_8.pt"):
+        assert f"note: {name} is from after the checkpoint to go on from, and is in {folder / 'set_aside'} now" in output
+        assert load_checkpoint(folder / "set_aside" / name).iteration == int(name[6])
+    assert [file.name for file in folder.glob("model_*.pt")] == ["model_5.pt"]
+    assert load_checkpoint(folder).iteration == 5
+    assert [row[0] for row in curve(folder)[1:]] == ["1", "2", "3", "4", "5"]
+
+
 def test_two_processes_do_not_train_in_one_folder(tmp_path: Path) -> None:
     training = Training(tmp_path, *new(tmp_path, 100_000))
     folder = await_checkpoint(training, tmp_path)

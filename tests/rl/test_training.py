@@ -124,6 +124,29 @@ def test_more_mini_batches_than_samples_are_refused(robot: Robot, tmp_path: Path
         trainer(robot, tmp_path, 1, "ppo.num_mini_batches=81")
 
 
+@pytest.mark.parametrize(
+    ("overrides", "rate"), [([], None), (["ppo.learning_rate=1e-5"], 1e-5), (["ppo.schedule=fixed"], 2e-4)]
+)
+def test_a_new_learning_rate_is_heeded_and_an_adapted_one_kept(
+    robot: Robot, tmp_path: Path, overrides: list[str], rate: float | None
+) -> None:
+    adapted = train(robot, tmp_path, 2).learner.learning_rate
+    assert adapted != 2e-4
+    second = trainer(robot, tmp_path, 3, *overrides)
+    second.resume(load_checkpoint(tmp_path))
+    assert second.learner.learning_rate == (rate or adapted)
+    assert {group["lr"] for group in second.learner.optimizer.param_groups} == {rate or adapted}
+
+
+def test_a_curve_counts_samples_exactly(tmp_path: Path) -> None:
+    writer = CurveWriter(tmp_path, 0)
+    writer.add({"samples": 10_403_840.0, "loss": 0.12345678})
+    writer.add({"samples": 10_485_760.0, "loss": math.nan})
+    CurveWriter(tmp_path, 10_485_760)
+    lines = (tmp_path / "learning.csv").read_text().splitlines()
+    assert lines == ["samples,loss", "10403840,0.123457", "10485760,nan"]
+
+
 def test_a_curve_takes_new_columns(tmp_path: Path) -> None:
     """As when a run goes on with a version that logs more, or less."""
     older = CurveWriter(tmp_path, 0)

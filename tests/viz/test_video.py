@@ -10,9 +10,10 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+from telebip import ROOT
 from telebip.errors import UserError
 from telebip.eval.rollout import Rollout
-from telebip.robot import Robot
+from telebip.robot import Robot, load_robot
 from telebip.viz import opengl
 from telebip.viz.picture import strobe
 from telebip.viz.render import Renderer
@@ -94,6 +95,13 @@ def test_a_strobe_shows_every_pose(opengl_works: None, walking: Rollout, robot: 
     shell = orange(np.asarray(Image.open(tmp_path / "walk.png")))
     assert shell.shape == (140, 400)
     assert np.diff(np.flatnonzero(shell.any(0))).max() > 20
+
+
+def test_a_robot_of_ones_own_needs_touch_sensors_and_no_bodies_named_after_feet(opengl_works: None) -> None:
+    own = load_robot(ROOT / "tests" / "robots" / "rotary_knee.xml")
+    with Renderer(own, SIZE) as renderer:
+        feet = renderer.place([own.home_qpos])
+    np.testing.assert_allclose(feet, [[[0.0, -0.1, 0.03], [0.0, 0.1, 0.03]]], atol=2e-3)
 
 
 def test_an_arrow_ends_where_the_camera_sees_its_ends(opengl_works: None, robot: Robot) -> None:
