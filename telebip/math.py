@@ -1,8 +1,8 @@
 """Quaternions (w, x, y, z) and frames, batched over leading dimensions, and how the tensors of all worlds lie in memory.
 
 A tensor (num_envs, size) lies column by column: what is one number of every world is one stretch of memory, over which a
-processor's vector unit passes in one go. Row by row, an operation on a column hops through memory, and takes five to ten times
-as long (docs/performance.md). Shapes and values know nothing of it.
+processor's vector unit passes in one go. Row by row, an operation on a column hops through memory, and takes up to ten times as
+long (docs/performance.md). Shapes and values know nothing of it.
 """
 
 import torch

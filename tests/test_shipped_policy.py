@@ -18,7 +18,7 @@ SPEEDS = (0.5, 0.7, 1.0)  # m/s
 
 OTHERS = {
     "telebip_efficient": (0.7, 0.698),
-    "telebip_robust": (0.7, 0.683),
+    "telebip_robust": (0.7, 0.676),
     "period_06": (0.7, 0.677),
     "telebip_slow": (0.7, 0.662),
     "telebip_fast": (1.0, 0.998),
