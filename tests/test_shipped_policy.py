@@ -56,6 +56,11 @@ def test_the_others_walk_as_fast_as_published(robot: Robot, policy: str) -> None
     assert summary.gait_period == pytest.approx(0.6 if policy == "period_06" else 0.5, rel=0.02)
 
 
+@pytest.mark.parametrize("policy", [name for name in OTHERS if name.startswith("telebip_")])
+def test_they_call_themselves_by_their_names(policy: str) -> None:
+    assert load_checkpoint(policy).task == policy
+
+
 @pytest.mark.parametrize("policy", OTHERS)
 def test_their_learning_curves_are_whole(policy: str) -> None:
     curve = read_curve(ROOT / "assets" / "policies" / policy)

@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 from test_commands_line import ran, refusal
 
+from telebip.cli import reproduce
+
 EVALUATE, REPRODUCE = "scripts/evaluate.py", "scripts/reproduce.py"
 SMALL = ("--num-envs", "2", "--duration", "2", "--device", "cpu")
 
@@ -64,6 +66,12 @@ def test_the_study_at_toy_size_goes_on_where_it_stopped(tmp_path: Path) -> None:
     assert again.count("trained already") == 2
     assert again.count("measured already") == 3
     assert results.stat().st_mtime_ns == written
+
+
+def test_the_toy_study_keeps_apart_from_the_real_one() -> None:
+    toy, real = reproduce._parse(["--quick"]), reproduce._parse([])
+    assert (real.out, real.runs) == ("docs/results", "runs/study")
+    assert (toy.out, toy.runs) == ("runs/study_quick/results", "runs/study_quick")
 
 
 def test_the_study_from_two_seeds_reports_both(tmp_path: Path) -> None:
