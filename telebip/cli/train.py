@@ -114,9 +114,9 @@ def train(
             return True
         engine = env.sim.backend
         if ranks.is_main:
+            require_space(run_dir, trainer.checkpoint_bytes(), config.ppo.keep_checkpoints)
             for file in set_aside_newer(run_dir, trainer.iteration):
                 console.print(f"note: {file.name} is from after the checkpoint to go on from, and is in {file.parent} now")
-            require_space(run_dir, trainer.checkpoint_bytes(), config.ppo.keep_checkpoints)
             describe_run(run_dir, config, str(device), engine, ranks.size)
         arithmetic = "bfloat16" if trainer.learner.use_mixed_precision else "float32"
         worlds = f"{config.num_envs} worlds" if ranks.size == 1 else f"{ranks.size} processes x {config.num_envs} worlds"

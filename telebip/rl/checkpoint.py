@@ -73,7 +73,7 @@ def save_checkpoint(
 
 def prune_checkpoints(run_dir: Path, keep: int) -> None:
     """Delete all but the `keep` newest of a run folder's `model_<iteration>.pt`."""
-    for file in _numbered(run_dir)[keep:]:
+    for file in [*_numbered(run_dir).values()][keep:]:
         file.unlink(missing_ok=True)
 
 
@@ -87,8 +87,8 @@ def set_aside_newer(run_dir: Path, iteration: int) -> list[Path]:
     """
     moved = []
     try:
-        for file in _numbered(run_dir):
-            if int(file.stem.removeprefix("model_")) > iteration:
+        for number, file in _numbered(run_dir).items():
+            if number > iteration:
                 (run_dir / "set_aside").mkdir(exist_ok=True)
                 moved.append(file.replace(run_dir / "set_aside" / file.name))
     except OSError as error:
@@ -161,13 +161,13 @@ def _find(given: Path) -> list[Path]:
         shipped = ", ".join(sorted(folder.name for folder in POLICIES.glob("*")))
         raise UserError(f"checkpoint '{path}' does not exist; policies that come with telebip: {shipped}")
     if numbered := _numbered(path):
-        return numbered
+        return [*numbered.values()]
     if (path / "policy.pt").is_file():
         return [path / "policy.pt"]
     raise UserError(f"folder '{path}' holds no checkpoint (model_<iteration>.pt or policy.pt)")
 
 
-def _numbered(run_dir: Path) -> list[Path]:
-    """Return a run folder's `model_<iteration>.pt`, the newest first."""
+def _numbered(run_dir: Path) -> dict[int, Path]:
+    """Return a run folder's `model_<iteration>.pt` by their iterations, the newest first."""
     files = {int(m[1]): file for file in run_dir.glob("model_*.pt") if (m := re.fullmatch(r"model_(\d+)\.pt", file.name))}
-    return [files[iteration] for iteration in sorted(files, reverse=True)]
+    return dict(sorted(files.items(), reverse=True))

@@ -65,8 +65,7 @@ class NativeSimulator:
         # Every physics step's values, (num_envs, decimation, ...), written by the engine's threads.
         sizes = {"actuator_force": model.nu, "actuator_velocity": model.nu, "sensordata": model.nsensordata}
         self._record = {name: np.zeros((num_envs, decimation, size)) for name, size in sizes.items()}
-        self._recorded = [torch.from_numpy(values).permute(1, 2, 0) for values in self._record.values()]
-        self._force, self._velocity, self._foot_force = (torch.zeros(decimation, k, num_envs) for k in (model.nu, model.nu, 2))
+        self._force, self._velocity, self._sensors = (torch.from_numpy(v) for v in self._record.values())
         home = torch.from_numpy(robot.home_qpos).float().expand(num_envs, -1)
         self.reset(torch.ones(num_envs, dtype=torch.bool), home, torch.zeros(num_envs, 12))
 
@@ -79,20 +78,12 @@ class NativeSimulator:
         self._read_faults()
         self.state.qpos.copy_(self._qpos)
         self.state.qvel.copy_(self._qvel)
-        self._read_means()
+        self.state.foot_force.copy_(_mean(self._sensors)[:, self._foot_adr])
+        self.state.joint_force.copy_(_mean(self._force))
+        power = self._force * self._velocity
+        self.state.joint_net_power.copy_(_mean(power))
+        self.state.joint_power.copy_(_mean(power.abs_()))
         return self.state
-
-    def _read_means(self) -> None:
-        """Bring the means over the physics steps up to date; each world's numbers are brought together by columns first."""
-        force, velocity, sensors = self._recorded
-        self._force.copy_(force)
-        self._velocity.copy_(velocity)
-        self._foot_force.copy_(sensors[:, self._foot_adr])
-        power = self._velocity.mul_(self._force)
-        torch.mean(self._foot_force, 0, out=self.state.foot_force.T)
-        torch.mean(self._force, 0, out=self.state.joint_force.T)
-        torch.mean(power, 0, out=self.state.joint_net_power.T)
-        torch.mean(power.abs_(), 0, out=self.state.joint_power.T)
 
     def write(self, targets: Tensor, wrench_w: Tensor) -> None:
         """See `Simulator.write`."""
@@ -141,3 +132,9 @@ def _silence() -> Iterator[None]:
         yield
     finally:
         before.set()
+
+
+def _mean(record: Tensor) -> Tensor:
+    """Return the mean over the physics steps of a record (num_envs, steps, ...); `record.mean(1)` takes three times as long."""
+    first, *others = record.unbind(1)
+    return sum(others, first) / record.shape[1]

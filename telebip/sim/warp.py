@@ -189,6 +189,6 @@ class WarpSimulator:
         self._launch(complete)
         with wp.ScopedCapture(device=self._wp_device) as capture:
             self._launch(complete)
-        self._overflow.zero_()  # that of a pose that nobody asked for
         wp.synchronize_device(self._wp_device)  # from here on everything runs on torch's stream
+        self._overflow.zero_()  # that of a pose that nobody asked for
         return capture.graph  # type: ignore[return-value]

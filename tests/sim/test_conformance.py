@@ -114,10 +114,8 @@ def overwrite(sim: Simulator, worlds: list[int], qpos: Tensor, qvel: Tensor) -> 
 
 def assert_conform(actual: Arrays, expected: Arrays, exact: bool) -> None:
     for name, reference in expected.items():
-        if exact and (name in ("qpos", "qvel") or reference.dtype == np.float32):
+        if exact:
             np.testing.assert_array_equal(actual[name], reference.astype(np.float32), err_msg=name)
-        elif exact:  # means over physics steps, of float64 numbers in float32
-            np.testing.assert_allclose(actual[name], reference, rtol=2e-6, atol=1e-4, err_msg=name)
         else:
             np.testing.assert_allclose(actual[name], reference, rtol=0.0, atol=TOLERANCE[name], err_msg=name)
 
