@@ -70,7 +70,7 @@ def feet(results: Results) -> Figure:
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(figsize=(7.2, 2.3))
         phase = np.array(s["phase_right"])
-        top = 1.05 * max(*s["right_bw"], *s["left_bw"], 0.1)
+        top = 1.25 * max(*s["right_bw"], *s["left_bw"], 0.1)  # room for the legend
         axes.fill_between(time, 0, top, where=(phase > 0).tolist(), step="mid", color=COLORS[0], alpha=0.08, lw=0)
         axes.fill_between(time, 0, top, where=(phase < 0).tolist(), step="mid", color=COLORS[1], alpha=0.08, lw=0)
         axes.plot(time, s["right_bw"], color=COLORS[0], lw=1.5, label="right foot")
