@@ -117,42 +117,10 @@ class Trainer:
             UserError: too many worlds are faulty, the engine's capacity is too small, the update has ruined the policy, or
                 the last checkpoint cannot be written anywhere.
         """
-        env, learner, cfg = self.env, self.learner, self.env.cfg.ppo
+        cfg = self.env.cfg.ppo
         log = RunLog(self.run_dir, self.samples, self.note) if self.ranks.is_main else None
-        learner.train_mode()
-        obs = self.view.get_observations()
-        while self.iteration < cfg.max_iterations and not self.ranks.any(stop(), env.device):
-            start = time.perf_counter()
-            env.set_progress(self.samples)
-            learner.get_policy().distribution.std_range[0] = min_std(cfg, self.samples)  # type: ignore[union-attr]
-            with torch.inference_mode():
-                obs, log_sums = self.collect(obs)
-                sums = dict(zip(env.log_names, log_sums.tolist(), strict=True))
-                collected = time.perf_counter()
-                counts = {key: value for key, value in sums.items() if key.startswith("fault/")}
-                self._check_faults(dict(counts))
-                learner.compute_returns(obs)
-            losses = learner.update()
-            self._check_weights(losses)
-            learned = time.perf_counter()
-
-            self.iteration += 1
-            batch = env.num_envs * cfg.num_steps_per_env * self.ranks.size
-            self.samples += batch
-            means = {key: value / cfg.num_steps_per_env for key, value in sums.items() if key not in counts}
-            episode_return, episode_length = self._episodes.recent()
-            scalars = {
-                **means,
-                **counts,
-                "train/episode_return": episode_return,
-                "train/episode_length": episode_length,
-                "train/action_std": learner.get_policy().output_std.mean().item(),
-                "train/learning_rate": learner.learning_rate,
-                **{f"loss/{key}": value for key, value in losses.items()},
-                "speed/samples_per_s": batch / (learned - start),
-                "speed/collect_s": collected - start,
-                "speed/learn_s": learned - collected,
-            }
+        while self.iteration < cfg.max_iterations and not self.ranks.any(stop(), self.env.device):
+            scalars = self.iterate()
             if log:
                 log.add(self.iteration, self.samples, scalars)
             if self.iteration % cfg.save_interval == 0:
@@ -161,6 +129,46 @@ class Trainer:
         self._save_finally()
         if log:
             log.close()
+
+    def iterate(self) -> dict[str, float]:
+        """Collect and learn once; return what TensorBoard gets.
+
+        Raises:
+            UserError: see `learn`.
+        """
+        env, learner, cfg = self.env, self.learner, self.env.cfg.ppo
+        start = time.perf_counter()
+        env.set_progress(self.samples)
+        learner.get_policy().distribution.std_range[0] = min_std(cfg, self.samples)  # type: ignore[union-attr]
+        learner.train_mode()
+        with torch.inference_mode():
+            obs, log_sums = self.collect(self.view.get_observations())
+            sums = dict(zip(env.log_names, log_sums.tolist(), strict=True))
+            collected = time.perf_counter()
+            counts = {key: value for key, value in sums.items() if key.startswith("fault/")}
+            self._check_faults(dict(counts))
+            learner.compute_returns(obs)
+        losses = learner.update()
+        self._check_weights(losses)
+        learned = time.perf_counter()
+
+        self.iteration += 1
+        batch = env.num_envs * cfg.num_steps_per_env * self.ranks.size
+        self.samples += batch
+        means = {key: value / cfg.num_steps_per_env for key, value in sums.items() if key not in counts}
+        episode_return, episode_length = self._episodes.recent()
+        return {
+            **means,
+            **counts,
+            "train/episode_return": episode_return,
+            "train/episode_length": episode_length,
+            "train/action_std": learner.get_policy().output_std.mean().item(),
+            "train/learning_rate": learner.learning_rate,
+            **{f"loss/{key}": value for key, value in losses.items()},
+            "speed/samples_per_s": batch / (learned - start),
+            "speed/collect_s": collected - start,
+            "speed/learn_s": learned - collected,
+        }
 
     def collect(self, obs: TensorDict) -> tuple[TensorDict, Tensor]:
         """Act from `obs` for `ppo.num_steps_per_env` steps and store them.
