@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from telebip.cli.common import Parser, open_checkpoint, resolve_device
+from telebip.cli.common import Parser, check_outputs, open_checkpoint, resolve_device
 from telebip.config import load_task, task_names
 from telebip.errors import UserError
 
@@ -133,11 +133,5 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     for name, values in (("--num-envs", options.num_envs), ("--rounds", [options.rounds])):
         if min(values) < 1:
             raise UserError(f"{name} must be at least 1, got {min(values)}")
-    if options.plot and Path(options.plot).suffix not in (".png", ".svg", ".pdf"):
-        raise UserError(f"--plot writes FILE.png, FILE.svg or FILE.pdf, got '{options.plot}'")
-    for file in filter(None, (options.json, options.plot)):
-        try:
-            Path(file).touch()  # now, and not after minutes of measuring
-        except OSError as error:
-            raise UserError(f"cannot write to '{file}': {error.strerror or error}") from error
+    check_outputs(options.json, options.plot)
     return options

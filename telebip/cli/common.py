@@ -80,6 +80,21 @@ def open_checkpoint(path: str | Path) -> "Checkpoint":
     return checkpoint
 
 
+def check_outputs(json: str | None, plot: str | None) -> None:
+    """Refuse files that cannot be written, now and not after minutes of measuring.
+
+    Raises:
+        UserError: a file cannot be written, or `plot` has an unknown ending.
+    """
+    if plot and Path(plot).suffix not in (".png", ".svg", ".pdf"):
+        raise UserError(f"--plot writes FILE.png, FILE.svg or FILE.pdf, got '{plot}'")
+    for file in filter(None, (json, plot)):
+        try:
+            Path(file).touch()
+        except OSError as error:
+            raise UserError(f"cannot write to '{file}': {error.strerror or error}") from error
+
+
 def resolve_device(name: str) -> "torch.device":
     """Return the torch device that `auto`, `cpu`, `cuda` or `cuda:N` means on this machine; `auto` prefers CUDA.
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from types import ModuleType
 
 from telebip import __version__
-from telebip.cli import benchmark, common, evaluate, export, play, reproduce, train
+from telebip.cli import benchmark, common, evaluate, export, play, race, reproduce, train
 from telebip.errors import UserError, nearest
 
 COMMANDS: dict[str, ModuleType] = {
@@ -15,6 +15,7 @@ COMMANDS: dict[str, ModuleType] = {
     "reproduce": reproduce,
     "export": export,
     "benchmark": benchmark,
+    "race": race,
 }
 """Name -> module with `main(argv)`; the first line of its docstring is the command's description."""
 

@@ -180,3 +180,19 @@ def throughput(rows: Sequence[dict[str, Any]], title: str) -> Figure:
         axes.set_ylim(bottom=0)
         axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure
+
+
+def race(races: Sequence[dict[str, Any]], title: str) -> Figure:
+    """Return of the episodes against samples and against time, one line a seed, of `telebip.rl.race.race`."""
+    with plt.rc_context(STYLE):
+        figure, (left, right) = plt.subplots(1, 2, figsize=(9.2, 2.8), sharey=True)
+        for i, (name, label) in enumerate({"telebip": "telebip", "stock": "rsl-rl's PPO in float32"}.items()):
+            for k, result in enumerate(races):
+                returns = np.array(result[name]["episode_return"], dtype=float)
+                minutes = np.cumsum(result[name]["seconds"]) / 60.0
+                left.plot(np.array(result["samples"]) / 1e6, returns, color=COLORS[i], lw=1.1, label=label if k == 0 else None)
+                right.plot(minutes, returns, color=COLORS[i], lw=1.1)
+        left.set(xlabel="million samples", ylabel="return of an episode", title=title)
+        right.set(xlabel="minutes of collecting and learning")
+        left.legend(loc="upper left")
+    return figure

@@ -5,8 +5,9 @@ slow moment of the machine hits both. Of every pair of iterations the ratio of t
 return that its episodes have after so many samples; several seeds show how much of a difference is chance.
 """
 
+import math
+import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -16,11 +17,11 @@ import torch
 from telebip.config import TaskConfig
 from telebip.env import TelebipEnv
 from telebip.rl.benchmark import StockTrainer
-from telebip.rl.train import Trainer
+from telebip.rl.train import Trainer, random_state, set_random_state
 from telebip.robot import Robot
 from telebip.sim import Backend
 
-Curve = dict[str, list[float]]
+Curve = dict[str, list[float | None]]
 RACERS = {"telebip": Trainer, "stock": StockTrainer}
 
 
@@ -45,21 +46,58 @@ def race(
         progress: called after each iteration of both.
 
     Returns:
-        Ready for JSON: `seed`, `samples` after each iteration, and for both racers a curve of `episode_return`,
-        `episode_length` [policy steps] and `seconds` of each iteration.
+        Ready for JSON: `seed`, the engine `backend`, the arithmetic of telebip's `update`, `samples` after each iteration, and
+        for both racers `episode_return`, `episode_length` [policy steps], which are None before an episode has ended, and
+        `seconds` of each iteration.
+
+    Raises:
+        UserError: a training cannot go on, see `Trainer.learn`.
     """
     threads = {"telebip": torch.get_num_threads(), "stock": stock_threads}
-    racers = {name: trainer(TelebipEnv(cfg, robot, device, backend), "", Path()) for name, trainer in RACERS.items()}
+    racers: dict[str, Trainer] = {}
+    random = {}  # each racer's own random numbers
+    for name, trainer in RACERS.items():
+        faults = Path(tempfile.gettempdir(), f"telebip_race_{name}")  # where they would be dumped
+        racers[name] = trainer(TelebipEnv(cfg, robot, device, backend), "", faults)
+        random[name] = random_state(device)
     curves: dict[str, Curve] = {name: {"episode_return": [], "episode_length": [], "seconds": []} for name in racers}
     at: list[int] = []
     while not at or at[-1] < samples:
         for name, racer in racers.items():
+            set_random_state(random[name], device)
             torch.set_num_threads(threads[name])
             scalars = racer.iterate()
-            curves[name]["episode_return"].append(scalars["train/episode_return"])
-            curves[name]["episode_length"].append(scalars["train/episode_length"])
+            random[name] = random_state(device)
+            for key in ("episode_return", "episode_length"):
+                value = scalars[f"train/{key}"]
+                curves[name][key].append(None if math.isnan(value) else value)
             curves[name]["seconds"].append(scalars["speed/collect_s"] + scalars["speed/learn_s"])
         torch.set_num_threads(threads["telebip"])
         at.append(racers["telebip"].samples)
         progress()
-    return {"seed": cfg.seed, "samples": at, **curves}
+    own = racers["telebip"]
+    update = "bfloat16" if own.learner.use_mixed_precision else "float32"
+    return {"seed": cfg.seed, "backend": own.env.sim.backend, "update": update, "samples": at, **curves}
+
+
+def verdict(races: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return what the races of one or several seeds come to.
+
+    Returns:
+        `samples` of each training; `episode_return`, for both racers the lowest and the highest of the seeds' last; `overlap`,
+        whether these intervals have a point in common; and `train_over_stock`, the median over all pairs of iterations of
+        rsl-rl's time over telebip's. A race's first pair, which allocates, counts only where there is no other.
+    """
+    last = {name: [race[name]["episode_return"][-1] for race in races] for name in RACERS}
+    interval = {name: (min(values), max(values)) for name, values in last.items()}
+    ratios = []
+    for race in races:
+        times = zip(race["stock"]["seconds"], race["telebip"]["seconds"], strict=True)
+        pairs = [stock / own for stock, own in times]
+        ratios += pairs[1:] or pairs
+    return {
+        "samples": races[0]["samples"][-1],
+        "episode_return": interval,
+        "overlap": max(low for low, _ in interval.values()) <= min(high for _, high in interval.values()),
+        "train_over_stock": median(ratios),
+    }

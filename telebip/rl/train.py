@@ -10,7 +10,7 @@ import math
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -233,17 +233,12 @@ class Trainer:
 
     def _training_state(self) -> dict[str, Any]:
         """Return what this process needs, besides the learner's state, to go on bit for bit."""
-        state = {"env": self.env.state_dict(), "episodes": self._episodes.state_dict(), "generator": torch.get_rng_state()}
-        if self.env.device.type == "cuda":
-            state["cuda_generator"] = torch.cuda.get_rng_state(self.env.device)
-        return state
+        return {"env": self.env.state_dict(), "episodes": self._episodes.state_dict(), **random_state(self.env.device)}
 
     def _load_training(self, state: dict[str, Any]) -> None:
         self.env.load_state_dict(state["env"])
         self._episodes.load_state_dict(state["episodes"])
-        torch.set_rng_state(state["generator"])
-        if self.env.device.type == "cuda" and "cuda_generator" in state:
-            torch.cuda.set_rng_state(state["cuda_generator"], self.env.device)
+        set_random_state(state, self.env.device)
 
     def _check_faults(self, counts: dict[str, float]) -> None:
         """Dump the first fault of each kind; stop, with a checkpoint, where there are too many or the engine is too small.
@@ -304,6 +299,19 @@ class Trainer:
             "actor": {"class_name": "MLPModel", **actor_cfg(ppo)},
             "critic": {"class_name": "MLPModel", **critic_cfg(ppo)},
         }
+
+
+def random_state(device: torch.device) -> dict[str, Tensor]:
+    """Return the states of torch's own generators, of the processor and of `device`."""
+    cuda = {"cuda_generator": torch.cuda.get_rng_state(device)} if device.type == "cuda" else {}
+    return {"generator": torch.get_rng_state(), **cuda}
+
+
+def set_random_state(state: Mapping[str, Any], device: torch.device) -> None:
+    """Go on from a `random_state`, of which another kind of device has less."""
+    torch.set_rng_state(state["generator"])
+    if device.type == "cuda" and "cuda_generator" in state:
+        torch.cuda.set_rng_state(state["cuda_generator"], device)
 
 
 def min_std(cfg: PpoConfig, samples: int) -> float:

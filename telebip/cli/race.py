@@ -1,0 +1,107 @@
+"""`race.py`: train beside rsl-rl's own PPO, from the same samples, and compare returns and time."""
+
+import argparse
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from telebip.cli.common import Parser, check_outputs, resolve_device
+from telebip.config import load_task, task_names
+from telebip.errors import UserError
+
+EXAMPLES = """\
+  race.py
+  race.py --task telebip_efficient --samples 8e6 --seeds 5 --json race.json --plot race.png
+  race.py ppo.mixed_precision=never num_envs=2048
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Parse arguments, train, print how it went and write the files asked for."""
+    options = _parse(argv)
+    from rich.console import Console
+
+    console = Console(highlight=False, soft_wrap=True)
+    with console.status("loading torch and the physics engine"):
+        import torch
+
+        from telebip.cli.evaluate import progress_bar
+        from telebip.eval import plots
+        from telebip.rl.benchmark import machine_name
+        from telebip.rl.process import prepare_cpu
+        from telebip.rl.race import RACERS, race, verdict
+        from telebip.rl.run import describe_code
+        from telebip.robot import load_robot
+
+    first = load_task(options.task, options.overrides)
+    configs = [load_task(options.task, [*options.overrides, f"seed={first.seed + k}"]) for k in range(options.seeds)]
+    device, threads = resolve_device(options.device), torch.get_num_threads()
+    if device.type == "cpu":
+        prepare_cpu()
+    robot, machine = load_robot(first.sim.robot), machine_name(device)
+    iterations = -(-options.samples // (first.num_envs * first.ppo.num_steps_per_env))
+
+    races, done = [], 0
+    with progress_bar(console) as show:
+
+        def progress() -> None:
+            nonlocal done
+            done += 1
+            show("training", done, iterations * len(configs))
+
+        show("training", 0, iterations * len(configs))
+        for config in configs:
+            races.append(race(config, robot, device, options.backend, options.samples, threads, progress))
+            if None in (races[-1][name]["episode_return"][-1] for name in RACERS):
+                raise UserError(f"no episode has ended after {races[-1]['samples'][-1]} samples; give more --samples")
+            console.print(f"seed {config.seed}: {_sentence(verdict(races[-1:]))}")
+            if options.json:  # after every seed: nothing is lost
+                about = {"machine": machine, "threads": threads, "task": options.task, "num_envs": first.num_envs}
+                content = {**about, "device": str(device), **describe_code(), "verdict": verdict(races), "races": races}
+                Path(options.json).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+
+    found, title = verdict(races), f"{options.task}, {first.num_envs} worlds, update in {races[0]['update']}"
+    console.print(f"{title}, {found['samples']:,} samples on {machine} ({races[0]['backend']}), torch threads: {threads}")
+    console.print(f"{len(races)} seed{'s' * (len(races) > 1)}: {_sentence(found)}")
+    if options.json:
+        console.print(f"wrote {options.json}")
+    if options.plot:
+        plots.race(races, title).savefig(options.plot, dpi=150, bbox_inches="tight")
+        console.print(f"wrote {options.plot}")
+
+
+def _sentence(found: dict) -> str:
+    """Return a verdict in words."""
+    own, stock = (f"{low:.2f}" if low == high else f"{low:.2f} to {high:.2f}" for low, high in found["episode_return"].values())
+    meet = f" ({'they overlap' if found['overlap'] else 'they do not overlap'})" if "to" in own + stock else ""
+    return f"return {own}, rsl-rl's {stock}{meet}; {found['train_over_stock']:.2f} times as fast"
+
+
+def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = Parser(
+        "Train from scratch with telebip's learner and with rsl-rl's PPO as it stands, in float32. Both have worlds of their "
+        "own, the same seeds and as many samples, and their iterations alternate: ratios of times hold on a busy machine.",
+        EXAMPLES,
+    )
+    parser.add_argument("--task", default="telebip_flat", metavar="NAME", help=f"{', '.join(task_names())}, or a YAML file")
+    parser.add_argument("--samples", type=whole_number, default=4_500_000, metavar="N", help="samples of each (default: 4.5e6)")
+    parser.add_argument("--seeds", type=int, default=3, metavar="N", help="races, from the task's seed on (default: 3)")
+    parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto, which prefers CUDA)")
+    parser.add_argument("--backend", default="auto", choices=("auto", "native", "warp"), help="physics engine (default: auto)")
+    parser.add_argument("--json", metavar="FILE", help="write every iteration's return and time, after each seed")
+    parser.add_argument("--plot", metavar="FILE", help="draw the returns over samples and over time (.png, .svg or .pdf)")
+    parser.add_argument("overrides", nargs="*", metavar="key.path=value", help="override any field of the task")
+    options = parser.parse(argv)
+    for name, value in (("--samples", options.samples), ("--seeds", options.seeds)):
+        if value < 1:
+            raise UserError(f"{name} must be at least 1, got {value}")
+    check_outputs(options.json, options.plot)
+    return options
+
+
+def whole_number(text: str) -> int:
+    """Read `4500000` or `4.5e6`; argparse turns a ValueError into a refusal that quotes the text."""
+    if not math.isfinite(number := float(text)):
+        raise ValueError
+    return int(number)
