@@ -22,7 +22,7 @@ from telebip.mdp.observations import heading_relative_quat, observation
 from telebip.mdp.randomization import Draws, initial_qpos, push_force, ranges
 from telebip.mdp.rewards import reward_terms
 from telebip.robot import Robot
-from telebip.sim import Backend, make_simulator
+from telebip.sim import Backend, indexed, make_simulator
 
 MODEL_FIELDS = ("geom_friction",)
 """Fields of the model that differ between worlds."""
@@ -78,7 +78,7 @@ class TelebipEnv(VecEnv):
         """
         self.cfg: TaskConfig = cfg
         self.robot = robot
-        self.device: torch.device = torch.device(device)
+        self.device: torch.device = indexed(torch.device(device))
         self.num_envs, self.num_actions = cfg.num_envs, 6
         self._keep_final_obs = keep_final_obs
         self._rewards = reward_terms(cfg.reward)

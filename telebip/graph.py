@@ -1,6 +1,8 @@
 """Tensor work recorded as a CUDA graph: one launch instead of hundreds."""
 
-from collections.abc import Callable
+import contextlib
+import gc
+from collections.abc import Callable, Iterator
 from typing import Generic, TypeVar
 
 import torch
@@ -36,14 +38,33 @@ class CudaGraph(Generic[Result]):
         return self._result
 
     def _record(self) -> tuple[torch.cuda.CUDAGraph, Result]:
-        graph = torch.cuda.CUDAGraph()
-        graph.register_generator_state(self._generator)
-        try:
-            with torch.cuda.device(self._device), torch.cuda.graph(graph, capture_error_mode="thread_local"):
-                result = self._function()
-        except RuntimeError as error:
-            raise RuntimeError(
-                "the step cannot be recorded as a CUDA graph. A reward of your own must not read values back to the host "
-                "(.item(), `if` on a tensor); sim.cuda_graph=false does without the graph"
-            ) from error
+        stream = torch.cuda.current_stream(self._device)
+        with torch.cuda.device(self._device), torch.inference_mode(False), torch.no_grad(), _no_garbage_collection():
+            graph = torch.cuda.CUDAGraph()
+            graph.register_generator_state(self._generator)
+            try:
+                with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+                    result = self._function()
+            except torch.OutOfMemoryError:
+                raise
+            except RuntimeError as error:
+                torch.cuda.set_stream(stream)  # where torch has not got to put it back
+                raise RuntimeError(
+                    "the step cannot be recorded as a CUDA graph. A reward of your own must not read values back to the host "
+                    "(.item(), `if` on a tensor), nor bring new ones from there (torch.tensor, a list as an index). Start "
+                    "anew; sim.cuda_graph=false does without the graph"
+                ) from error
         return graph, result
+
+
+@contextlib.contextmanager
+def _no_garbage_collection() -> Iterator[None]:
+    """Collect garbage now and not in between: finalizers free memory and graphs, which a recording forbids."""
+    gc.collect()
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()

@@ -1,5 +1,8 @@
 """What `env.step` records as CUDA graphs can be recorded: one step's operators, replayed without Python, make all others."""
 
+import gc
+import subprocess
+import sys
 from typing import Any
 
 import pytest
@@ -7,10 +10,12 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from telebip import ROOT
 from telebip.config import load_task
 from telebip.env import TelebipEnv
-from telebip.graph import CudaGraph
+from telebip.graph import CudaGraph, _no_garbage_collection
 from telebip.robot import Robot
+from telebip.sim import indexed
 from tests.worlds import put_low, random_actions
 
 EVENTFUL = (
@@ -143,11 +148,39 @@ def test_on_cuda_the_graphs_do_what_the_functions_do(robot: Robot) -> None:
     assert torch.equal(plain.generator.get_state(), env.generator.get_state())
 
 
+def test_no_garbage_is_collected_while_a_recording_lasts() -> None:
+    for before in (False, True):
+        gc.enable() if before else gc.disable()
+        with pytest.raises(KeyError), _no_garbage_collection():
+            assert not gc.isenabled()
+            raise KeyError
+        assert gc.isenabled() == before
+
+
+READS_BACK = """
+import torch
+from telebip.config import load_task
+from telebip.env import TelebipEnv
+from telebip.robot import load_robot
+
+env = TelebipEnv(load_task("telebip_flat", ["num_envs=4"]), load_robot("assets/telebip.xml"), "cuda", "warp")
+env._rewards["cmd"] = lambda context: context.action.sum(1) * context.action.sum().item()
+for _ in range(2):
+    env.step(torch.zeros(4, 6, device="cuda"))
+"""
+
+
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-def test_a_reward_that_reads_back_is_refused_with_what_to_do(robot: Robot) -> None:
-    env = TelebipEnv(load_task("telebip_flat", ["num_envs=4"]), robot, "cuda", "warp")
-    env._rewards["cmd"] = lambda context: context.action.sum(1) * context.action.sum().item()
-    env.step(torch.zeros(4, 6, device="cuda"))
-    with pytest.raises(RuntimeError, match=r"sim\.cuda_graph=false"):
-        env.step(torch.zeros(4, 6, device="cuda"))
+def test_a_reward_that_reads_back_is_refused_with_what_to_do() -> None:
+    """In a process of its own, which a recording that broke off leaves unfit for others."""
+    done = subprocess.run([sys.executable, "-c", READS_BACK], cwd=ROOT, capture_output=True, text=True, timeout=600)
+    assert "RuntimeError: the step cannot be recorded as a CUDA graph." in done.stderr
+    assert "sim.cuda_graph=false" in done.stderr
+
+
+def test_cuda_without_a_number_is_the_current_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 2)
+    assert indexed(torch.device("cuda")) == torch.device("cuda:2")
+    assert indexed(torch.device("cuda:1")) == torch.device("cuda:1")
+    assert indexed(torch.device("cpu")) == torch.device("cpu")

@@ -56,7 +56,7 @@ def quat_mul(a: Tensor, b: Tensor) -> Tensor:
 class HostReads(TorchDispatchMode):
     """Notes the operators that wait for the device, or whose result's shape depends on the data."""
 
-    OPERATORS = ("_local_scalar_dense", "item", "nonzero", "masked_select", "is_nonzero", "equal", "_unique2")
+    OPERATORS = ("_local_scalar_dense", "item", "nonzero", "masked_select", "is_nonzero", "equal", "_unique2", "normal")
 
     def __init__(self) -> None:
         super().__init__()

@@ -112,4 +112,7 @@ def resolve_device(name: str) -> "torch.device":
         raise UserError(f"unknown device '{name}'; valid: auto, cpu, cuda, cuda:N")
     if name not in available:
         raise UserError(f"device '{name}' is not there; this machine has: {', '.join(available)}")
-    return torch.device(name)
+    device = torch.device(name)
+    if device.type == "cuda":
+        torch.cuda.set_device(device)
+    return device

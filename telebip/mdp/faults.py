@@ -49,6 +49,7 @@ class FaultRecorder:
 
     def take(self) -> dict[str, dict[str, Any]]:
         """Return the records not yet taken, by kind: this waits for the device."""
-        new = [(row, kind) for row, kind in enumerate(KINDS) if kind not in self._taken and self._seen[row]]
+        seen = zip(KINDS, self._seen.tolist(), strict=True)
+        new = [(row, kind) for row, (kind, is_seen) in enumerate(seen) if is_seen and kind not in self._taken]
         self._taken.update(kind for _, kind in new)
         return {kind: {name: value[row].cpu().clone() for name, value in self._records.items()} for row, kind in new}

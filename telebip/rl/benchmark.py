@@ -9,7 +9,7 @@ the worlds and inputs from which every engine step starts. The rungs then go ove
     collect     policy, `env.step` and storage, as in training
     learn       returns and update; the weights are put back afterwards, so that every round walks alike
 
-On CUDA the device is waited for at the two ends of a measurement, and not in between.
+On CUDA the device's own clock counts, and the device is waited for at the two ends of a rung alone, never in between.
 """
 
 import contextlib
@@ -118,10 +118,11 @@ class Ladder:
             self._trainer.collect(self._trainer.view.get_observations())
         learner.storage.clear()
 
-        seconds = {"engine": 0.0}
+        engine = Stopwatch(env.device)
         for call in calls:
             call.prepare(env.sim)
-            seconds["engine"] += self._timed(env.sim.advance)
+            engine.time(env.sim.advance)
+        seconds = {"engine": engine.seconds()}
         calls.clear()
         env.load_state_dict(start)
         with torch.inference_mode():
@@ -162,16 +163,43 @@ class Ladder:
         trainer.learner.load(copy.deepcopy(self._weights), load_cfg=None, strict=True)
 
     def _timed(self, function: Callable[[], Any]) -> float:
-        """Return how long a call took, from an idle device to an idle device [s]."""
+        """Return how long a call took, from an idle device on [s]."""
+        watch = Stopwatch(self.env.device)
+        watch.time(function)
+        return watch.seconds()
+
+
+class Stopwatch:
+    """Adds up how long calls take: on CUDA how long the device does, between events that it passes on its way."""
+
+    def __init__(self, device: torch.device) -> None:
+        """Wait until `device` is idle."""
+        self._device, self._seconds = device, 0.0
+        self._events: list[tuple[torch.cuda.Event, torch.cuda.Event]] = []
         self._synchronize()
-        start = time.perf_counter()
+
+    def time(self, function: Callable[[], Any]) -> None:
+        """Call `function`, and count it."""
+        if self._device.type != "cuda":
+            start = time.perf_counter()
+            function()
+            self._seconds += time.perf_counter() - start
+            return
+        before, after = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        stream = torch.cuda.current_stream(self._device)
+        before.record(stream)
         function()
+        after.record(stream)
+        self._events.append((before, after))
+
+    def seconds(self) -> float:
+        """Return the sum [s]."""
         self._synchronize()
-        return time.perf_counter() - start
+        return self._seconds + sum(before.elapsed_time(after) for before, after in self._events) / 1000.0
 
     def _synchronize(self) -> None:
-        if self.env.device.type == "cuda":
-            torch.cuda.synchronize(self.env.device)
+        if self._device.type == "cuda":
+            torch.cuda.synchronize(self._device)
 
 
 def measure(
@@ -197,7 +225,9 @@ def measure(
         for _ in range(rounds + 1):
             seconds.append(ladder.round())
             progress()
-    except torch.OutOfMemoryError as error:
+    except RuntimeError as error:  # torch's own kind of it, or Warp's with this text
+        if not isinstance(error, torch.OutOfMemoryError) and "Failed to allocate" not in str(error):
+            raise
         raise UserError(f"{cfg.num_envs} worlds do not fit into the memory of {device}") from error
     return {
         "backend": ladder.env.sim.backend,

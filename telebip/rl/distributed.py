@@ -77,8 +77,17 @@ class Ranks:
         import torch.distributed
 
         states: list[Any] | None = [None] * self.size if self.is_main else None
-        torch.distributed.gather_object(state, states)
+        torch.distributed.gather_object(_on_cpu(state), states)
         return states or []
+
+
+def _on_cpu(value: Any) -> Any:
+    """Return a state with its tensors on the CPU: the receiver would put them on a GPU numbered as the sender's."""
+    import torch
+
+    if isinstance(value, dict):
+        return {key: _on_cpu(part) for key, part in value.items()}
+    return value.cpu() if isinstance(value, torch.Tensor) else value
 
 
 @contextmanager

@@ -64,7 +64,8 @@ class FastPPO(PPO):
             lambda: self._forward(self.critic, self.critic.get_latent(obs)),
         )
         distribution.update(mean)
-        transition.actions = distribution.sample()
+        mean, std = distribution.params
+        transition.actions = torch.randn_like(mean).mul_(std).add_(mean)  # torch.normal would wait for CUDA to look at std
         transition.actions_log_prob = distribution.log_prob(transition.actions)
         transition.distribution_params = distribution.params
         return transition.actions
@@ -152,10 +153,10 @@ class FastPPO(PPO):
         """Lower the learning rate by 1.5 where the KL divergence is over twice the desired one, raise it where under half."""
         if self.schedule != "adaptive":
             return
-        kl = self._sum_over_processes(kl) / self.gpu_world_size
-        if kl > 2.0 * self.desired_kl:
+        divergence = self._sum_over_processes(kl).item() / self.gpu_world_size
+        if divergence > 2.0 * self.desired_kl:
             self.learning_rate = max(1e-5, self.learning_rate / 1.5)
-        elif 0.0 < kl < self.desired_kl / 2.0:
+        elif 0.0 < divergence < self.desired_kl / 2.0:
             self.learning_rate = min(1e-2, self.learning_rate * 1.5)
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate

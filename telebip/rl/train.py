@@ -324,6 +324,7 @@ def uses_bfloat16(mixed_precision: str, device: torch.device) -> bool:
     if mixed_precision != "auto":
         return mixed_precision == "always"
     if device.type == "cuda":
-        return torch.cuda.is_bf16_supported(including_emulation=False)
+        with torch.cuda.device(device):
+            return torch.cuda.is_bf16_supported(including_emulation=False)
     capabilities = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}
     return bool(capabilities.get("avx512_bf16") or capabilities.get("amx_bf16"))

@@ -8,7 +8,14 @@ from telebip.errors import UserError
 from telebip.robot import Robot
 from telebip.sim.base import Backend, SimState, Simulator
 
-__all__ = ["Backend", "SimState", "Simulator", "choose_backend", "make_simulator"]
+__all__ = ["Backend", "SimState", "Simulator", "choose_backend", "indexed", "make_simulator"]
+
+
+def indexed(device: torch.device) -> torch.device:
+    """Return `device` with its number: `cuda` is torch's current CUDA device, which Warp does not know."""
+    if device.type == "cuda" and device.index is None:
+        return torch.device("cuda", torch.cuda.current_device())
+    return device
 
 
 def choose_backend(backend: Backend, device: torch.device) -> Backend:
@@ -40,4 +47,4 @@ def make_simulator(
         return NativeSimulator(robot, num_envs, decimation, model_fields)
     from telebip.sim.warp import WarpSimulator
 
-    return WarpSimulator(robot, num_envs, decimation, device, model_fields, *capacity)
+    return WarpSimulator(robot, num_envs, decimation, indexed(device), model_fields, *capacity)

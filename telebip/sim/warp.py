@@ -156,7 +156,8 @@ class WarpSimulator:
         if complete not in self._graphs:
             self._graphs[complete] = self._capture(complete)
         # On torch's stream, so that torch's work before and after is ordered with it without a synchronisation.
-        wp.capture_launch(self._graphs[complete], stream=wp.stream_from_torch(torch.cuda.current_stream(self.device)))
+        with torch.cuda.device(self.device):  # the default stream's handle means that of the current device
+            wp.capture_launch(self._graphs[complete], stream=wp.stream_from_torch(torch.cuda.current_stream(self.device)))
 
     def _launch(self, complete: bool) -> None:
         """Run the physics steps of one policy step, and if `complete` all else of `step`: `memory_before` and the means."""

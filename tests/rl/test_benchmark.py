@@ -9,6 +9,8 @@ from worlds import MakeEnv, put_low, random_actions
 
 from telebip.config import load_task
 from telebip.env import TelebipEnv
+from telebip.errors import UserError
+from telebip.rl import benchmark
 from telebip.rl.benchmark import Ladder, allocated_bytes, recorded, summary
 from telebip.rl.checkpoint import load_checkpoint
 from telebip.robot import Robot
@@ -93,3 +95,24 @@ def test_a_step_leaves_no_memory_behind(make_env: MakeEnv, backend: str) -> None
         del action
         held.append(allocated_bytes(torch.device("cpu")))
     assert held[0] == held[1] == held[2]
+
+
+@pytest.mark.parametrize(
+    ("raised", "seen"),
+    [
+        (torch.OutOfMemoryError("CUDA out of memory"), UserError),
+        (RuntimeError("Failed to allocate 400 bytes on device 'cuda:0'"), UserError),  # as Warp says it
+        (RuntimeError("something else"), RuntimeError),
+    ],
+    ids=["torch", "warp", "other"],
+)
+def test_worlds_that_do_not_fit_are_told_from_other_errors(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch, raised: RuntimeError, seen: type[Exception]
+) -> None:
+    def no_ladder(*args: object) -> Ladder:
+        raise raised
+
+    monkeypatch.setattr(benchmark, "Ladder", no_ladder)
+    config, cpu = load_task("telebip_flat", ["num_envs=8"]), torch.device("cpu")
+    with pytest.raises(seen, match="8 worlds do not fit" if seen is UserError else "something else"):
+        benchmark.measure(config, robot, cpu, "native", load_checkpoint("telebip_flat"), 1)

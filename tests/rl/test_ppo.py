@@ -12,6 +12,7 @@ from telebip.config import load_task
 from telebip.env import TelebipEnv
 from telebip.rl.train import Trainer
 from telebip.robot import Robot
+from tests.worlds import HostReads
 
 SMALL = ("num_envs=8", "ppo.num_steps_per_env=10", "ppo.hidden_dims=[16,16]", "episode.length=0.2")
 
@@ -84,3 +85,26 @@ def test_a_rollout_holds_what_its_own_policy_said(robot: Robot, precision: str) 
     actions = storage.actions.flatten(0, 1)
     torch.testing.assert_close(gaussian.log_prob(actions).sum(1), storage.actions_log_prob.flatten(), rtol=1e-5, atol=1e-4)
     assert 0.3 < ((actions - mean) / std).std() < 3.0
+
+
+def test_a_rollout_reads_nothing_back_to_the_host(robot: Robot) -> None:
+    with HostReads() as control:
+        torch.distributions.Normal(torch.zeros(3), torch.ones(3)).sample()  # looks whether every deviation is positive
+    assert control.seen == ["normal"]
+
+    config = load_task("telebip_flat", [*SMALL, "ppo.num_steps_per_env=3"])
+    trainer = Trainer(TelebipEnv(config, robot, "cpu", "native"), "", Path())
+    with torch.inference_mode(), HostReads() as reads:
+        trainer.collect(trainer.view.get_observations())
+    assert reads.seen == []
+
+
+def test_actions_are_those_that_rsl_rl_samples(robot: Robot) -> None:
+    trainer, policy_obs = rollout(robot)
+    learner, obs = trainer.learner, trainer.env.get_observations()
+    assert torch.equal(obs["policy"], policy_obs)
+    with torch.inference_mode():
+        torch.manual_seed(5)
+        actions = learner.act(obs)
+        torch.manual_seed(5)
+        assert torch.equal(actions, learner.actor.distribution.sample())
