@@ -5,6 +5,7 @@ import math
 from pathlib import Path
 
 import pytest
+from processes import fresh
 from test_commands_line import ran, refusal
 
 from telebip.rl.benchmark import summary
@@ -15,7 +16,7 @@ TINY = ("--device", "cpu", "--rounds", "2", "ppo.num_steps_per_env=3")
 
 def test_the_table_and_its_json(tmp_path: Path) -> None:
     file, plot = tmp_path / "speed.json", tmp_path / "speed.png"
-    text = ran(BENCHMARK, "--num-envs", "4", "8", "--stock", "--json", str(file), "--plot", str(plot), *TINY)
+    text = ran(BENCHMARK, "--num-envs", "4", "8", "--stock", "--json", str(file), "--plot", str(plot), *TINY, run=fresh)
     measured, (header, *lines) = text.splitlines()[:2], text.splitlines()[3:6]
     assert measured == ["measured 4 worlds", "measured 8 worlds"]
     assert header.split()[:5] == ["worlds", "engine", "env", "env/engine", "collect"]

@@ -5,10 +5,12 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
+from processes import Done, forked, fresh
 
 from telebip import ROOT
 from telebip.config import load_task
@@ -20,11 +22,7 @@ TRAIN, PLAY, GALLERY = "scripts/train.py", "scripts/play.py", "scripts/gallery.p
 TINY = ("--num-envs", "8", "--device", "cpu", "ppo.num_steps_per_env=5", "ppo.hidden_dims=[16,16]")
 
 
-def run(script: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, script, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=120)
-
-
-def ran(script: str, *arguments: str) -> str:
+def ran(script: str, *arguments: str, run: Callable[..., Done] = forked) -> str:
     """Run a script that must succeed and return what it printed."""
     done = run(script, *arguments)
     assert done.returncode == 0, done.stderr
@@ -34,7 +32,7 @@ def ran(script: str, *arguments: str) -> str:
 
 def refusal(script: str, *arguments: str) -> str:
     """Run a script that must refuse its arguments and return its one line on standard error."""
-    done = run(script, *arguments)
+    done = forked(script, *arguments)
     assert done.returncode == 2, done.stdout + done.stderr
     lines = done.stderr.splitlines()
     assert len(lines) == 1, done.stderr
@@ -129,7 +127,9 @@ def test_a_trained_policy_can_be_played_and_recorded(run_dir: Path) -> None:
     assert {"model_2.pt", "policy.pt", "config.yaml", "run.json"} <= {path.name for path in run_dir.iterdir()}
     record = run_dir / "walk.rrd"
     others = ("--beside", "zero", "random")
-    text = ran(PLAY, "--checkpoint", str(run_dir), "--duration", "1", "--record", str(record), "--device", "cpu", *others)
+    text = ran(
+        PLAY, "--checkpoint", str(run_dir), "--duration", "1", "--record", str(record), "--device", "cpu", *others, run=fresh
+    )
     assert "model_2.pt: telebip_slow, 1 world x 1 s" in text
     assert "agent 'zero': telebip_slow, 1 world x 1 s" in text
     assert "agent 'random': telebip_slow, 1 world x 1 s" in text
@@ -138,7 +138,7 @@ def test_a_trained_policy_can_be_played_and_recorded(run_dir: Path) -> None:
 
 
 def test_pictures_are_made_anew(tmp_path: Path) -> None:
-    text = ran(GALLERY, "--only", "control_loop.png", "stride.png", "--out", str(tmp_path))
+    text = ran(GALLERY, "--only", "control_loop.png", "stride.png", "--out", str(tmp_path), run=fresh)
     assert [line.split(":")[0] for line in text.splitlines()] == [f"{tmp_path}/control_loop.png", f"{tmp_path}/stride.png"]
     for name in ("control_loop.png", "stride.png"):
         assert 10_000 < (tmp_path / name).stat().st_size < 300_000

@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
+from processes import fresh
 from test_commands_line import ran, refusal
 
 RACE = "scripts/race.py"
@@ -13,7 +14,7 @@ TINY = ("--device", "cpu", "num_envs=8", "ppo.num_steps_per_env=10", "ppo.hidden
 
 def test_two_seeds(tmp_path: Path) -> None:
     file, plot = tmp_path / "race.json", tmp_path / "race.png"
-    text = ran(RACE, "--samples", "2e2", "--seeds", "2", "--json", str(file), "--plot", str(plot), *TINY)
+    text = ran(RACE, "--samples", "2e2", "--seeds", "2", "--json", str(file), "--plot", str(plot), *TINY, run=fresh)
     first, second, about, both, *wrote = text.splitlines()
     number = r"-?\d+\.\d\d"
     assert re.fullmatch(f"seed 3: return {number}, rsl-rl's {number}; {number} times as fast", first)

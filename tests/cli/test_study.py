@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+from processes import fresh
 from test_commands_line import ran, refusal
 
 from telebip.cli import reproduce
@@ -14,7 +15,7 @@ SMALL = ("--num-envs", "2", "--duration", "2", "--device", "cpu")
 
 def test_evaluate_writes_results_and_reports(tmp_path: Path) -> None:
     policy = ("--checkpoint", "assets/policies/telebip_flat", "--suite", "tracking,gait", "--commands", "0.7")
-    printed = ran(EVALUATE, *policy, *SMALL, "--out", str(tmp_path), "--label", "mine")
+    printed = ran(EVALUATE, *policy, *SMALL, "--out", str(tmp_path), "--label", "mine", run=fresh)
     assert {file.name for file in tmp_path.iterdir()} == {"results.json", "report.md", "report.html", "cost_of_transport.svg"}
     results = json.loads((tmp_path / "results.json").read_text())
     assert (results["label"], [row["command_mps"] for row in results["tracking"]]) == ("mine", [0.7])
@@ -55,7 +56,7 @@ def test_a_mistake_is_one_line(arguments: list[str], named: str) -> None:
 def test_the_study_at_toy_size_goes_on_where_it_stopped(tmp_path: Path) -> None:
     where = ("--quick", "--device", "cpu", "--out", str(tmp_path / "out"), "--runs", str(tmp_path / "runs"))
     only = ("--only", "telebip_efficient", "period_06", "dcm")
-    ran(REPRODUCE, *where, *only)
+    ran(REPRODUCE, *where, *only, run=fresh)
     assert {path.name for path in (tmp_path / "runs").iterdir()} == {"telebip_efficient-seed1", "period_06-seed1"}
     report = (tmp_path / "out" / "report.md").read_text()
     for label in ("RL, efficient", "RL, period 0.6 s", "DCM", "article: RL"):
