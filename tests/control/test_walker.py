@@ -16,6 +16,7 @@ from telebip.eval.rollout import Rollout, roll_out
 from telebip.eval.walk import summarise
 
 NAMES = pytest.mark.parametrize("name", PLACEMENTS)
+SPEEDS, WORLDS = (0.5, 0.7, 1.0, 0.0, -0.3), 4  # m/s, and worlds at each speed
 
 
 def walk(env: TelebipEnv, name: str, command: tuple[float, float, float], seconds: float) -> Rollout:
@@ -23,10 +24,22 @@ def walk(env: TelebipEnv, name: str, command: tuple[float, float, float], second
     return roll_out(env, make_controller(name, env), round(seconds / env.step_dt))
 
 
+@pytest.fixture(scope="module")
+def straight(make_env: MakeEnv) -> dict[str, Rollout]:
+    """Five seconds of each walker at all speeds at once."""
+    rollouts, commands = {}, torch.tensor([[speed, 0.0, 0.0] for speed in SPEEDS])
+    for name in PLACEMENTS:
+        env = make_env(calm=True, num_envs=len(SPEEDS) * WORLDS)
+        env.set_commands(commands.repeat_interleave(WORLDS, dim=0))
+        rollouts[name] = roll_out(env, make_controller(name, env), round(5.0 / env.step_dt))
+    return rollouts
+
+
 @NAMES
-@pytest.mark.parametrize("speed", [0.5, 0.7, 1.0, 0.0, -0.3])
-def test_it_walks(make_env: MakeEnv, name: str, speed: float) -> None:
-    summary = summarise(walk(make_env(calm=True), name, (speed, 0.0, 0.0), 5.0), skip=2.0)
+@pytest.mark.parametrize("speed", SPEEDS)
+def test_it_walks(straight: dict[str, Rollout], name: str, speed: float) -> None:
+    first = SPEEDS.index(speed) * WORLDS
+    summary = summarise(straight[name].select(slice(first, first + WORLDS)), skip=2.0)
     assert summary.falls == 0
     assert summary.speed == pytest.approx((speed, 0.0), abs=0.06)
     assert summary.yaw_drift_deg < 15.0
