@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from processes import forked
 from worlds import MakeEnv, put
 
 from telebip import ROOT
@@ -21,6 +22,7 @@ from telebip.mdp.rewards import EXTRA, reward_term
 from telebip.rl.curve import read_curve
 
 TINY = ("--num-envs", "4", "--device", "cpu", "--max-iterations", "1", "ppo.num_steps_per_env=4", "ppo.hidden_dims=[8,8]")
+SHORT = ("--duration", "0.1", "--device", "cpu")
 
 
 @pytest.fixture(autouse=True)
@@ -51,17 +53,8 @@ def test_the_page_trains_as_it_says(tmp_path: Path) -> None:
     (row,) = read_curve(run_dir)
     assert -0.05 < row["reward/level"] < 0.0  # the trunk tilts by a few degrees in the first steps
 
-    play = [
-        sys.executable,
-        str(ROOT / "scripts" / "play.py"),
-        "--checkpoint",
-        str(run_dir),
-        "--duration",
-        "0.1",
-        "--device",
-        "cpu",
-    ]
-    assert subprocess.run(play, cwd=tmp_path, capture_output=True, timeout=300).returncode == 0  # the function is not there
+    play = forked(str(ROOT / "scripts" / "play.py"), "--checkpoint", str(run_dir), *SHORT, cwd=tmp_path)
+    assert play.returncode == 0, play.stderr  # the function is not there
 
 
 def test_the_environment_adds_weight_times_function(make_env: MakeEnv) -> None:

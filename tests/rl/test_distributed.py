@@ -10,8 +10,9 @@ from typing import Any
 
 import pytest
 import torch
+from processes import FORKS
 from tensordict import TensorDict
-from torch.multiprocessing.spawn import spawn
+from torch.multiprocessing.spawn import start_processes
 
 from telebip import ROOT
 from telebip.config import load_task
@@ -94,7 +95,7 @@ def test_two_processes_learn_what_one_does(tmp_path: Path) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    spawn(one_of_two, (port, str(tmp_path)), nprocs=SIZE)
+    start_processes(one_of_two, (port, str(tmp_path)), nprocs=SIZE, start_method=FORKS.get_start_method())
     first, second = (torch.load(tmp_path / f"rank_{rank}.pt", weights_only=True) for rank in range(SIZE))
 
     assert max(g.abs().max() for g in expected["gradient"]) > 1e-3
