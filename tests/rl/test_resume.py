@@ -1,6 +1,5 @@
 """A training that is killed and resumed is, from its last checkpoint on, the training that was never interrupted."""
 
-import multiprocessing
 import os
 import random
 import signal
@@ -12,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from processes import FORKS
 
 from telebip.cli.common import run
 from telebip.errors import UserError
@@ -20,10 +20,6 @@ from telebip.rl.checkpoint import load_checkpoint
 SMALL = ("num_envs=16", "ppo.num_steps_per_env=10", "ppo.hidden_dims=[32,16]", "episode.length=0.5", "ppo.save_interval=2")
 """Episodes that end by falls and by time-outs, pushes and commands that change, within a few iterations."""
 BUSY = ("disturbance.push.interval=[0.1,0.3]", "command.resampling_time=0.2", "ppo.symmetry=phase")
-
-FORKS = multiprocessing.get_context("forkserver")
-"""Processes of their own, which need not import torch anew."""
-FORKS.set_forkserver_preload(["telebip.cli.train", "telebip.env", "telebip.rl.train", "rich.progress"])
 
 
 class Training:
