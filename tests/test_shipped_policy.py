@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 
 from telebip import ROOT
 from telebip.config import load_task
@@ -28,20 +29,26 @@ OTHERS = {
 
 
 def walk(
-    robot: Robot, speed: float, worlds: int, seconds: float, backend: Backend = "native", policy: str = "telebip_flat"
+    robot: Robot, *speeds: float, worlds: int, seconds: float, backend: Backend = "native", policy: str = "telebip_flat"
 ) -> Rollout:
-    """Walk a shipped policy without disturbances, from random initial velocities."""
+    """Walk `worlds` of a shipped policy at each speed, without disturbances and from random initial velocities."""
     checkpoint = load_checkpoint(ROOT / "assets" / "policies" / policy)
     calm = [f"disturbance.{name}.enabled=false" for name in ("push", "friction", "noise")]
-    config = load_task(checkpoint.config, [f"num_envs={worlds}", f"episode.length={seconds + 1}", *calm])
+    config = load_task(checkpoint.config, [f"num_envs={len(speeds) * worlds}", f"episode.length={seconds + 1}", *calm])
     env = TelebipEnv(config, robot, "cpu", backend)
-    env.set_command(speed, 0.0, 0.0)
+    env.set_commands(torch.tensor([[speed, 0.0, 0.0] for speed in speeds]).repeat_interleave(worlds, dim=0))
     return roll_out(env, load_policy(checkpoint, "cpu"), round(seconds / env.step_dt))
 
 
+@pytest.fixture(scope="module")
+def at_all_speeds(robot: Robot) -> Rollout:
+    return walk(robot, *SPEEDS, worlds=4, seconds=10.0)
+
+
 @pytest.mark.parametrize("speed", SPEEDS)
-def test_it_walks_at_the_commanded_speed(robot: Robot, speed: float) -> None:
-    summary = summarise(walk(robot, speed, worlds=4, seconds=10.0), skip=5.0)
+def test_it_walks_at_the_commanded_speed(at_all_speeds: Rollout, speed: float) -> None:
+    first = 4 * SPEEDS.index(speed)
+    summary = summarise(at_all_speeds.select(slice(first, first + 4)), skip=5.0)
     assert summary.falls == 0
     assert summary.speed[0] == pytest.approx(speed, rel=0.05)
     assert summary.gait_period == pytest.approx(0.5, rel=0.02)
