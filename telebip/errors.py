@@ -15,6 +15,14 @@ class UserError(Exception):
         super().__init__(" ".join(message.split()).encode("utf-8", "backslashreplace").decode())
 
 
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether an exception says so: Python's, torch's, Warp's or that of C++."""
+    said = ("bad_alloc", "can't allocate memory", "Failed to allocate", "out of memory")
+    return isinstance(error, MemoryError) or (
+        isinstance(error, RuntimeError | ValueError) and any(text in str(error) for text in said)
+    )
+
+
 def nearest(name: str, valid: Iterable[str]) -> str:
     """Return the end of an error line: the closest valid name, or all of them: `nearest("slwo", ["slow", "fast"])`."""
     valid = sorted(valid)

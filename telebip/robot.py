@@ -45,7 +45,7 @@ class Robot:
 
 
 def load_robot(path: str | Path) -> Robot:
-    """Load a six-actuator biped; relative paths start at the working directory, then at telebip's own folder.
+    """Load a six-actuator biped; relative paths start at telebip's own folder, then at the working directory.
 
     The MJCF must name the body `trunk` with a free joint, the joints of `JOINTS` with a range and one position actuator of the
     same name each, a touch sensor `<foot>_force` for each of `FEET`, the geom `floor`, and the keyframe `home`; see
@@ -54,7 +54,7 @@ def load_robot(path: str | Path) -> Robot:
     Raises:
         UserError: the file is missing or is no valid MJCF, or something is missing or of another kind; the message says what.
     """
-    file = next((p for p in (Path(path), ROOT / path) if is_file(p)), None)
+    file = next((p for p in (ROOT / path, Path(path)) if is_file(p)), None)
     if file is None:
         raise UserError(f"robot file '{path}' does not exist")
     try:

@@ -49,6 +49,40 @@ def test_the_robot_lies_beside_its_task_whatever_the_working_directory(tmp_path:
     assert load_task("telebip_flat").sim.robot == "assets/telebip.xml"  # telebip's own, from telebip's folder
 
 
+def test_a_robot_given_from_the_working_directory_is_found_from_any_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = tmp_path / "robots" / "mine.xml"
+    robot.parent.mkdir()
+    robot.write_text((FOLDER / "rotary_knee.xml").read_text())
+    (tmp_path / "tasks").mkdir()
+    (tmp_path / "tasks" / "mine.yaml").write_text("base: telebip_flat\nsim: {robot: robots/mine.xml}\n")
+    monkeypatch.chdir(tmp_path)
+    assert load_task("telebip_flat", ["sim.robot=robots/mine.xml"]).sim.robot == str(robot)
+    assert load_task("tasks/mine.yaml").sim.robot == str(robot)
+
+
+def test_no_file_of_the_working_directory_stands_for_telebips_own_robot(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = tmp_path / "assets" / "telebip.xml"
+    other.parent.mkdir()
+    other.write_text((FOLDER / "rotary_knee.xml").read_text())
+    monkeypatch.chdir(tmp_path)
+    assert load_robot(load_task("telebip_flat").sim.robot).path == ROOT / "assets" / "telebip.xml"
+    named = load_task("telebip_flat", ["sim.robot=assets/telebip.xml"]).sim.robot  # by the user, who means that one
+    assert load_robot(named).path == other
+
+
+def test_a_base_lies_beside_the_task_that_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "sub" / "common.yaml").write_text("base: telebip_flat\nseed: 5\n")
+    (tmp_path / "sub" / "mine.yaml").write_text("base: common.yaml\nnum_envs: 3\n")
+    monkeypatch.chdir(tmp_path)
+    task = load_task("sub/mine.yaml")
+    assert (task.seed, task.num_envs) == (5, 3)
+
+
 def test_it_is_played_and_measured_from_its_checkpoint_alone(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert load_checkpoint(run_dir).config.action.knee == 0.5
     play.main(["--checkpoint", str(run_dir), "--num-envs", "2", "--duration", "1", "--device", "cpu"])

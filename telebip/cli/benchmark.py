@@ -47,8 +47,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         from telebip.rl.run import describe_code
         from telebip.robot import load_robot
 
-    policy = options.checkpoint or (options.task if (POLICIES / str(options.task)).is_dir() else "telebip_flat")
-    checkpoint = open_checkpoint(policy)
+    policy = options.checkpoint or _policy_for(options.task, options.overrides)
+    checkpoint = open_checkpoint(policy if options.checkpoint else POLICIES / policy)
     task = options.task or checkpoint.task
     configs = [load_task(options.task or checkpoint.config, [*options.overrides, f"num_envs={n}"]) for n in options.num_envs]
     if configs[0].ppo.symmetry != checkpoint.config.ppo.symmetry:
@@ -92,6 +92,17 @@ def main(argv: Sequence[str] | None = None) -> None:
 
         throughput(rows, f"{task} on {machine}").savefig(options.plot, dpi=150, bbox_inches="tight")
         console.print(f"wrote {options.plot}")
+
+
+def _policy_for(task: str | None, overrides: Sequence[str]) -> str:
+    """Return the policy of `assets/policies` that walks in a task: its own, or one that learned as much of the gait."""
+    from telebip.rl.checkpoint import POLICIES
+
+    symmetry = load_task(task or "telebip_flat", overrides).ppo.symmetry
+    for name in (Path(task or "").stem, "telebip_flat"):
+        if (POLICIES / name / "policy.pt").is_file() and open_checkpoint(POLICIES / name).config.ppo.symmetry == symmetry:
+            return name
+    return "telebip_efficient"
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:

@@ -8,7 +8,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from telebip.errors import UserError, nearest
+from telebip.errors import UserError, is_out_of_memory, nearest
+from telebip.viz.opengl import check_opengl
 
 if TYPE_CHECKING:
     import torch
@@ -58,7 +59,13 @@ def _is_telebip() -> bool:
 def run(command: Callable[[], None]) -> NoReturn:
     """Run a command: exit status 0, 2 after one line on standard error for a `UserError`, 130 when interrupted."""
     try:
-        command()
+        check_opengl()  # MuJoCo reads MUJOCO_GL when it is imported, and would fail with a traceback
+        try:
+            command()
+        except Exception as error:
+            if is_out_of_memory(error):
+                raise UserError("out of memory; take fewer worlds (--num-envs)") from error
+            raise
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
@@ -88,9 +95,12 @@ def check_outputs(json: str | None, plot: str | None) -> None:
     """
     if plot and Path(plot).suffix not in (".png", ".svg", ".pdf"):
         raise UserError(f"--plot writes FILE.png, FILE.svg or FILE.pdf, got '{plot}'")
-    for file in filter(None, (json, plot)):
+    for file in map(Path, filter(None, (json, plot))):
+        is_new = not file.exists()
         try:
-            Path(file).touch()
+            file.touch()
+            if is_new:
+                file.unlink()
         except OSError as error:
             raise UserError(f"cannot write to '{file}': {error.strerror or error}") from error
 

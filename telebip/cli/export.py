@@ -26,6 +26,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", metavar="FILE.onnx", default="policy.onnx", help="file to write (default: policy.onnx)")
     parser.add_argument("overrides", nargs="*", metavar="key.path=value", help="override any field of the task, as sim.robot")
     options = parser.parse(argv)
+    for override in options.overrides:
+        if override.startswith("ppo."):
+            raise UserError(f"override '{override}': a network is exported as it was trained; ppo.* is a part of it")
     out = Path(options.out)
     if out.suffix != ".onnx":
         raise UserError(f"--out writes FILE.onnx, got '{out}'")

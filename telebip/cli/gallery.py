@@ -40,8 +40,10 @@ def main(argv: Sequence[str] | None = None) -> None:
         if name not in PICTURES:
             raise UserError(f"no picture '{name}'; {nearest(name, PICTURES)}")
     choose_opengl()
+    from telebip.eval.report import make_folder
+
+    make_folder(options.out)
     gallery = Gallery(options.checkpoint, tuple(options.command))
-    options.out.mkdir(parents=True, exist_ok=True)
     for name in options.only or PICTURES:
         note = PICTURES[name](gallery, options.out / name)
         file = options.out / name

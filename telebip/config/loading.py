@@ -48,7 +48,7 @@ def load(schema: type[Schema], source: str | Schema, overrides: Sequence[str] = 
         if not equals or not re.fullmatch(r"\w+(\.\w+)*", key):
             raise UserError(f"{where} is not of the form key.path=value")
         _, parsed = _load_yaml(value, where)
-        _apply(config, [(key, parsed, where)], origins)
+        _apply(config, [_with_robot_found((key, parsed, where), Path())], origins)
     return _validate(config, origins, name)
 
 
@@ -75,14 +75,15 @@ def task_names() -> list[str]:
 
 def _layers(task: str, named_at: str = "", below: tuple[Path, ...] = ()) -> list[list[Leaf]]:
     """Return the leaves of a task's file and, before them, of the bases it builds on."""
-    path = _task_path(task, named_at)
+    path = _task_path(task, named_at, *(file.parent for file in below[-1:]))
     if path in below:
         raise UserError(f"{named_at}base '{task}' leads back to itself")
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"{named_at}{_shown(path)}: {error}") from error
-    leaves = [_from_its_folder(leaf, path) for leaf in _parse_yaml(text, _shown(path))]
+    folders = [path.parent, Path()] if path.parent != CONFIGS else [path.parent]
+    leaves = [_with_robot_found(leaf, *folders) for leaf in _parse_yaml(text, _shown(path))]
     for key, value, where in leaves:
         if key == "base":
             if not isinstance(value, str):
@@ -92,18 +93,21 @@ def _layers(task: str, named_at: str = "", below: tuple[Path, ...] = ()) -> list
     return [leaves]
 
 
-def _from_its_folder(leaf: Leaf, file: Path) -> Leaf:
-    """Let a task file name the robot that lies beside it, whatever the working directory."""
+def _with_robot_found(leaf: Leaf, *folders: Path) -> Leaf:
+    """Make the path of a robot of one's own absolute, so that it is found again from any working directory."""
     key, value, where = leaf
-    if key == "sim.robot" and isinstance(value, str) and is_file(file.parent / value):
-        return key, str((file.parent / value).resolve()), where
+    if key == "sim.robot" and isinstance(value, str):
+        for file in (folder / value for folder in folders):
+            if is_file(file) and file.resolve() != (ROOT / value).resolve():
+                return key, str(file.resolve()), where
     return leaf
 
 
-def _task_path(task: str, named_at: str) -> Path:
+def _task_path(task: str, named_at: str, *folders: Path) -> Path:
+    """Return a task's file: a name's in `configs/`, a path's from the first of `folders` or the working directory."""
     names_file = task.endswith((".yaml", ".yml"))
-    path = Path(task) if names_file else CONFIGS / f"{task}.yaml"
-    if is_file(path):
+    paths = [folder / task for folder in (*folders, Path())] if names_file else [CONFIGS / f"{task}.yaml"]
+    if path := next(filter(is_file, paths), None):
         return path
     if names_file:
         raise UserError(f"{named_at}task file '{task}' does not exist")

@@ -27,7 +27,7 @@ class SimConfig:
 
 @dataclass
 class EpisodeConfig:
-    length: float = quantity("s", gt=0)
+    length: float = quantity("s", gt=0, le=1e6)
     min_hip_height: float = quantity("m", ge=0)
     reset_joint_pos: float = quantity(ge=0)
     reset_joint_vel: float = quantity(ge=0)
@@ -55,7 +55,7 @@ class CommandConfig:
 
 @dataclass
 class GaitConfig:
-    period: float = quantity("s", gt=0)
+    period: float = quantity("s", gt=0, le=60)
 
 
 @dataclass

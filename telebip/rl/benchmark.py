@@ -30,7 +30,7 @@ from torch import Tensor, nn
 
 from telebip.config import TaskConfig
 from telebip.env import TelebipEnv
-from telebip.errors import UserError
+from telebip.errors import UserError, is_out_of_memory
 from telebip.rl.checkpoint import Checkpoint
 from telebip.rl.train import Trainer
 from telebip.robot import Robot
@@ -225,8 +225,8 @@ def measure(
         for _ in range(rounds + 1):
             seconds.append(ladder.round())
             progress()
-    except RuntimeError as error:  # torch's own kind of it, or Warp's with this text
-        if not isinstance(error, torch.OutOfMemoryError) and "Failed to allocate" not in str(error):
+    except Exception as error:
+        if not is_out_of_memory(error):
             raise
         raise UserError(f"{cfg.num_envs} worlds do not fit into the memory of {device}") from error
     return {

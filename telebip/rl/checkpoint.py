@@ -19,6 +19,11 @@ from telebip.robot import JOINTS, Robot
 
 FORMAT = "telebip-checkpoint-1"
 POLICIES = ROOT / "assets" / "policies"
+CONTENT = {
+    **{"task": str, "config": str, "observation": dict, "action": list, "iteration": int, "samples": int},
+    **{"actor_state_dict": dict, "training": list, "robot": dict},
+}
+"""What a checkpoint file holds; the last two, not all of them do."""
 
 
 @dataclass(frozen=True)
@@ -119,9 +124,12 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
 
 def _load_file(file: Path) -> Checkpoint:
     content = load_archive(file, "checkpoint", FORMAT)
-    missing = {"task", "config", "observation", "action", "iteration", "samples", "actor_state_dict"} - content.keys()
+    missing = CONTENT.keys() - content.keys() - {"training", "robot"}
     if missing:
         raise UserError(f"checkpoint '{file}' is not complete: it lacks {', '.join(sorted(missing))}")
+    for name, kind in CONTENT.items():
+        if not isinstance(content.get(name, kind()), kind):
+            raise UserError(f"checkpoint '{file}' is not a telebip checkpoint: its {name} is no {kind.__name__}")
     _check_layout(file, content["observation"], content["action"])
     learner = {key: value for key, value in content.items() if key.endswith("_state_dict")}
     config = parse_config(content["config"], f"{file}:config")
@@ -154,17 +162,15 @@ def robot_properties(robot: Robot) -> dict[str, list[float]]:
 
 def _find(given: Path) -> list[Path]:
     """Return the files that a path stands for, the best one first."""
-    path = next((p for p in (given, ROOT / given, POLICIES / given) if is_file(p) or is_folder(p)), given)
-    if is_file(path):
-        return [path]
-    if not is_folder(path):
-        shipped = ", ".join(sorted(folder.name for folder in POLICIES.glob("*")))
-        raise UserError(f"checkpoint '{path}' does not exist; policies that come with telebip: {shipped}")
-    if numbered := _numbered(path):
-        return [*numbered.values()]
-    if (path / "policy.pt").is_file():
-        return [path / "policy.pt"]
-    raise UserError(f"folder '{path}' holds no checkpoint (model_<iteration>.pt or policy.pt)")
+    paths = [path for path in (given, ROOT / given, POLICIES / given) if is_file(path) or is_folder(path)]
+    for path in paths:
+        policy = path / "policy.pt"
+        if files := [path] if is_file(path) else [*_numbered(path).values()] or [policy] * is_file(policy):
+            return files
+    if paths:
+        raise UserError(f"folder '{paths[0]}' holds no checkpoint (model_<iteration>.pt or policy.pt)")
+    shipped = ", ".join(sorted(folder.name for folder in POLICIES.glob("*")))
+    raise UserError(f"checkpoint '{given}' does not exist; policies that come with telebip: {shipped}")
 
 
 def _numbered(run_dir: Path) -> dict[int, Path]:

@@ -58,7 +58,7 @@ def load_network(checkpoint: Checkpoint, device: str | torch.device = "cpu") -> 
     actor = MLPModel(obs, OBS_GROUPS, "actor", len(JOINTS), **actor_cfg(checkpoint.config.ppo))
     try:
         actor.load_state_dict(checkpoint.learner["actor_state_dict"])
-    except (RuntimeError, KeyError) as error:
+    except (RuntimeError, KeyError, TypeError, AttributeError) as error:
         raise UserError(f"checkpoint '{checkpoint.path}': its weights do not fit its configuration") from error
     policy = SymmetricPolicy(actor, device) if checkpoint.config.ppo.symmetry == "phase" else actor
     return policy.to(device).eval()

@@ -4,15 +4,34 @@ import ctypes
 import os
 import sys
 
-from telebip.errors import UserError
+from telebip.errors import UserError, nearest
 
 PACKAGES = {"egl": ("libEGL.so.1", "libegl1"), "osmesa": ("libOSMesa.so.8", "libosmesa6")}
 """Library of each way to render without a display, and the Debian package that holds it."""
+
+NAMES = ("egl", "osmesa", "glfw", "glx", "disable")
+"""What `MUJOCO_GL` may be; and as MuJoCo takes them:"""
+
+MORE_NAMES = ("wgl", "cgl", "disabled", "off", "false", "0", "enable", "enabled", "on", "true", "1")
 
 
 def has_display() -> bool:
     """Whether a window can be opened, as far as the environment says."""
     return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def check_opengl() -> None:
+    """Refuse a `MUJOCO_GL` with which MuJoCo could not be imported.
+
+    Raises:
+        UserError: the user chose an unknown way to render, or one whose library is not there.
+    """
+    chosen = os.environ.get("MUJOCO_GL", "").lower().strip()
+    if chosen in PACKAGES and not _loads(PACKAGES[chosen][0]):
+        library, package = PACKAGES[chosen]
+        raise UserError(f"MUJOCO_GL={chosen}, but {library} is not there; on Debian, apt-get install {package}")
+    if chosen and chosen not in NAMES + MORE_NAMES:
+        raise UserError(f"MUJOCO_GL={chosen} names no way to render; {nearest(chosen, NAMES)}")
 
 
 def choose_opengl() -> None:
@@ -21,12 +40,9 @@ def choose_opengl() -> None:
     Call it before MuJoCo is imported: with `MUJOCO_GL=egl` and no libEGL, that would fail with a traceback.
 
     Raises:
-        UserError: the user chose a way whose library is not there.
+        UserError: see `check_opengl`.
     """
-    chosen = os.environ.get("MUJOCO_GL", "").lower()
-    if chosen in PACKAGES and not _loads(PACKAGES[chosen][0]):
-        library, package = PACKAGES[chosen]
-        raise UserError(f"MUJOCO_GL={chosen}, but {library} is not there; on Debian, apt-get install {package}")
+    check_opengl()
     if not has_display():
         found = [name for name, (library, _) in PACKAGES.items() if _loads(library)]
         os.environ.setdefault("MUJOCO_GL", found[0] if found else "disable")

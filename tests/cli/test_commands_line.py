@@ -59,6 +59,7 @@ LONG = 300 * "a"
         ([PLAY, "--controller", "dcm", "control.step_tim=1"], ["did you mean 'control.step_time'?"]),
         ([PLAY, "--agent", "zero", "--record", "foo.txt"], ["--record", "foo.txt", ".rrd", ".mp4"]),
         ([GALLERY, "--only", "waling.gif"], ["waling.gif", "did you mean 'walking.gif'?"]),
+        ([GALLERY, "--only", "stride.png", "--out", "README.md"], ["cannot write to folder 'README.md'"]),
         ([PLAY, "--agent", "zero", "--show", "0"], ["--show", "at least 1"]),
         ([PLAY, "--agent", "zero", "--connect", "localhost"], ["--connect", "--viewer rerun"]),
         ([PLAY, "--agent", "zero", "--viewer", "mujco"], ["--viewer", "mujco", "mujoco"]),

@@ -26,6 +26,7 @@ def test_it_exports_and_says_how_exactly(tmp_path: Path, capsys: pytest.CaptureF
         (["--checkpoint", "telebip_flat", "--out", "policy.pt"], r"--out writes FILE.onnx, got 'policy.pt'"),
         (["--checkpoint", "telebip_falt"], r"'telebip_falt' does not exist; policies that come with telebip: .*telebip_flat"),
         (["--out", "policy.onnx"], r"required: --checkpoint"),
+        (["--checkpoint", "telebip_efficient", "ppo.symmetry=none"], r"'ppo.symmetry=none': a network is exported as it was"),
     ],
 )
 def test_a_mistake_is_one_line(arguments: list[str], message: str) -> None:

@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from telebip import ROOT, __version__
-from telebip.cli.common import Parser, invocation
+from telebip.cli.common import Parser, invocation, run
 from telebip.cli.main import COMMANDS, dispatch
 from telebip.errors import UserError
 
@@ -63,3 +63,31 @@ def test_the_command_passes_arguments_on_and_sets_the_exit_status() -> None:
     assert done.stderr == "error: unknown task 'telebip_slwo'; did you mean 'telebip_slow'?\n"
     assert telebip("train", "--num-env", "8").stderr.rstrip().endswith("(see telebip train --help)")
     assert telebip("--version").returncode == 0
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        ValueError("std::bad_alloc"),  # of the native engine
+        RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 9 bytes"),
+        RuntimeError("Failed to allocate 9 bytes on device 'cuda:0'"),  # of Warp
+    ],
+    ids=lambda error: type(error).__name__,
+)
+def test_too_many_worlds_are_one_line(error: Exception, capsys: pytest.CaptureFixture[str]) -> None:
+    def command() -> None:
+        raise error
+
+    with pytest.raises(SystemExit) as end:
+        run(command)
+    assert end.value.code == 2
+    assert capsys.readouterr().err == "error: out of memory; take fewer worlds (--num-envs)\n"
+
+
+def test_other_errors_keep_their_traceback() -> None:
+    def command() -> None:
+        raise RuntimeError("a bug of ours")
+
+    with pytest.raises(RuntimeError, match="a bug of ours"):
+        run(command)

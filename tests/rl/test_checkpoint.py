@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from telebip import ROOT
 from telebip.config import TaskConfig, load_task
 from telebip.errors import UserError
 from telebip.mdp.observations import LAYOUT
@@ -188,3 +189,17 @@ def test_interrupted_writing_leaves_the_older_file(tmp_path: Path, config: TaskC
         save_checkpoint(path, "telebip_slow", config, 8, 800, {"weights": torch.zeros(9), "bad": lambda: None})
     assert path.read_bytes() == before
     assert load_checkpoint(tmp_path).iteration == 7
+
+
+@pytest.mark.parametrize(
+    ("entry", "value"),
+    [("task", 3), ("iteration", "x"), ("samples", 1.5), ("actor_state_dict", [1]), ("training", 5), ("robot", ["mass"])],
+)
+def test_an_entry_of_another_kind_is_refused(tmp_path: Path, config: TaskConfig, entry: str, value: Any) -> None:
+    assert f"its {entry} is no " in refusal(edited(tmp_path / "model_1.pt", config, {entry: value}))
+
+
+def test_a_folder_without_checkpoints_hides_no_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "telebip_flat").mkdir()  # as in `runs/`, which has a folder for each task
+    assert load_checkpoint("telebip_flat").path == ROOT / "assets" / "policies" / "telebip_flat" / "policy.pt"

@@ -170,6 +170,10 @@ def test_the_users_choice_is_kept_or_refused(libraries: Callable[..., None], mon
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
     opengl.choose_opengl()
     assert opengl.os.environ["MUJOCO_GL"] == "osmesa"
+    monkeypatch.setenv("MUJOCO_GL", "elg")
+    with pytest.raises(UserError, match=r"MUJOCO_GL=elg names no way to render; did you mean 'egl'\?"):
+        opengl.check_opengl()
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")
     libraries("libEGL.so.1")
     with pytest.raises(UserError, match=r"MUJOCO_GL=osmesa, but libOSMesa.so.8 is not there; .* install libosmesa6"):
         opengl.choose_opengl()
