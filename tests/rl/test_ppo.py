@@ -107,4 +107,4 @@ def test_actions_are_those_that_rsl_rl_samples(robot: Robot) -> None:
         torch.manual_seed(5)
         actions = learner.act(obs)
         torch.manual_seed(5)
-        assert torch.equal(actions, learner.actor.distribution.sample())
+        assert torch.equal(actions, learner.actor.distribution.sample())  # type: ignore[union-attr]
