@@ -17,6 +17,9 @@ EXAMPLES = """\
   evaluate.py --controller dcm control.step_time=0.2 sim.decimation=1
 """
 
+SET_HERE = {"num_envs": "--num-envs", "episode.length": "--duration"}
+"""Fields of the task that the evaluator sets, and the options that say how."""
+
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Parse arguments, measure, print, and write the report."""
@@ -30,6 +33,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         from telebip.eval.suites import Protocol, check_suites, evaluate
         from telebip.robot import load_robot
     suites = check_suites(options.suite.split(","))
+    check_overrides(options.overrides, suites)
     device = resolve_device(options.device)
     if options.controller:
         subject = controller_subject(options.controller, options.label, options.overrides)
@@ -57,6 +61,20 @@ def main(argv: Sequence[str] | None = None) -> None:
     console.print(f"wrote {out}/results.json, report.md with its pictures, and report.html")
 
 
+def check_overrides(overrides: Sequence[str], suites: Sequence[str]) -> None:
+    """Refuse overrides of what the evaluator itself sets.
+
+    Raises:
+        UserError: there is one.
+    """
+    for override in overrides:
+        key = override.partition("=")[0]
+        if key in SET_HERE:
+            raise UserError(f"'{override}' cannot be overridden here; use {SET_HERE[key]}")
+        if "push" in suites and (key == "episode.reset_heading" or key.startswith("disturbance.push.")):
+            raise UserError(f"the push suite has its own pushes, of robots that face x; '{override}' goes with other suites")
+
+
 def controller_subject(name: str, label: str | None, overrides: Sequence[str] = ()):
     """Return a model-based walker as a subject of the evaluator, with `overrides` of its parameters and of the task."""
     from telebip.control.config import load_controller, split_overrides
@@ -72,6 +90,7 @@ def controller_subject(name: str, label: str | None, overrides: Sequence[str] = 
         limited=False,
         source=" ".join(["evaluate.py --controller", name, *overrides]),
         fingerprint=sha256(repr((name, load_controller(name, own), config.sim, config.action)).encode()).hexdigest()[:16],
+        overrides=tuple(task),
     )
 
 
@@ -88,6 +107,7 @@ def subject_of(checkpoint_path: str, label: str | None, overrides: Sequence[str]
         run_dir=checkpoint.path.parent,
         source=" ".join(["evaluate.py --checkpoint", checkpoint_path, *overrides]),
         fingerprint=sha256(checkpoint.path.read_bytes()).hexdigest()[:16],
+        overrides=tuple(overrides),
     )
 
 

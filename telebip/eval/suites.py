@@ -47,6 +47,7 @@ class Subject:
     run_dir: Path | None = None  # where its learning curve is kept
     source: str = ""  # how to measure it again: a command
     fingerprint: str = ""  # of what decides how it walks: weights, parameters
+    overrides: tuple[str, ...] = ()  # of the task, which hold in the evaluator's worlds too
 
 
 @dataclass(frozen=True)
@@ -147,8 +148,8 @@ def commands_of(subject: Subject, protocol: Protocol) -> tuple[float, ...]:
 
 
 def make_env(subject: Subject, robot: Robot, protocol: Protocol, num_envs: int, duration: float) -> TelebipEnv:
-    """Create undisturbed worlds of the subject's task."""
-    config = as_evaluated(subject.config, num_envs, duration)
+    """Create worlds of the subject's task, undisturbed unless its overrides say otherwise."""
+    config = as_evaluated(subject.config, num_envs, duration, subject.overrides)
     return TelebipEnv(config, robot, protocol.device, protocol.backend)
 
 

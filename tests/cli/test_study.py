@@ -40,6 +40,10 @@ def test_evaluate_measures_a_model_based_walker_at_the_physics_rate(tmp_path: Pa
         ([EVALUATE, "--controller", "dcm", "--commands", "0.5;0.7"], "invalid speeds value: '0.5;0.7'"),
         ([EVALUATE, "--checkpoint", "assets/policies/telebip_flat", "--num-envs", "0"], "--num-envs must be between 1"),
         ([EVALUATE, "--checkpoint", "assets/policies/telebip_flat", "--out", "/proc/x"], "cannot write to folder '/proc/x'"),
+        ([EVALUATE, "--controller", "dcm", "num_envs=99"], "'num_envs=99' cannot be overridden here; use --num-envs"),
+        ([EVALUATE, "--controller", "dcm", "episode.length=1"], "use --duration"),
+        ([EVALUATE, "--controller", "dcm", "disturbance.push.enabled=true"], "the push suite has its own pushes"),
+        ([EVALUATE, "--controller", "dcm", "episode.reset_heading=3"], "robots that face x"),
         ([REPRODUCE, "--only", "telebip_flta"], "did you mean 'telebip_flat'?"),
         ([REPRODUCE, "--seeds", "0"], "--seeds must be 1 or more, got 0"),
         (

@@ -18,7 +18,7 @@ from telebip.eval import plots
 from telebip.eval.learning import learning_curve, samples_to
 from telebip.eval.push import PushProtocol
 from telebip.eval.report import read_results, write_report, write_results
-from telebip.eval.suites import SUITES, Protocol, Subject, check_suites, commands_of, evaluate, is_current
+from telebip.eval.suites import SUITES, Protocol, Subject, check_suites, commands_of, evaluate, is_current, make_env
 from telebip.robot import Robot
 
 POLICY = "assets/policies/telebip_flat"
@@ -158,6 +158,16 @@ def test_suites_are_checked_and_ordered() -> None:
     assert check_suites(["gait", "tracking"]) == ("tracking", "gait")
     with pytest.raises(UserError, match=r"unknown suite 'trakcing'; did you mean 'tracking'\?"):
         check_suites(["trakcing"])
+
+
+def test_overrides_hold_in_the_worlds_that_are_measured(robot: Robot) -> None:
+    overrides = ("disturbance.friction.enabled=true", "disturbance.friction.range=[0.05,0.06]", "episode.reset_heading=3")
+    slippery = make_env(subject_of(POLICY, None, overrides), robot, PROTOCOL, num_envs=2, duration=1.0)
+    assert (slippery.sim.model_fields["geom_friction"][:, robot.engine_floor_id, 0] < 0.07).all()
+    assert slippery.cfg.episode.reset_heading == 3.0
+    assert not slippery.cfg.disturbance.push.enabled
+    pushed = controller_subject("dcm", None, ("disturbance.push.enabled=true", "control.step_time=0.3"))
+    assert make_env(pushed, robot, PROTOCOL, num_envs=2, duration=1.0).cfg.disturbance.push.enabled
 
 
 def test_commands_keep_to_what_was_trained(subject: Subject) -> None:
