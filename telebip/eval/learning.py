@@ -20,8 +20,9 @@ def learning_curve(run_dir: Path, points: int = 200) -> dict[str, Any] | None:
     """Return a run's curves, thinned to at most `points` rows, and the samples that 95 % of the final value took.
 
     Returns:
-        `samples` and one list for each of `COLUMNS`; `samples_to_95_length` and `samples_to_95_return`. None if the folder has
-        no learning curve (a policy that was copied out of its run), or an empty one.
+        `samples` and one list for each of `COLUMNS`, the last row among them; `samples_to_95_length` and
+        `samples_to_95_return`. None if the folder has no learning curve (a policy that was copied out of its run), or an
+        empty one.
 
     Raises:
         UserError: the file is damaged.
@@ -37,9 +38,10 @@ def learning_curve(run_dir: Path, points: int = 200) -> dict[str, Any] | None:
     if not rows:
         return None
     every = max(1, -(-len(rows) // points))
+    kept = slice((len(rows) - 1) % every, None, every)
     return {
-        "samples": samples[::every],
-        **{name: curve[::every] for name, curve in curves.items()},
+        "samples": samples[kept],
+        **{name: curve[kept] for name, curve in curves.items()},
         "samples_to_95_length": samples_to(samples, curves["episode_length"]),
         "samples_to_95_return": samples_to(samples, curves["episode_return"]),
     }

@@ -195,6 +195,11 @@ def test_a_learning_curve_is_thinned_and_a_damaged_one_named(tmp_path: Path) -> 
     assert curve is not None
     assert len(curve["samples"]) == 20
     assert curve["samples_to_95_length"] == 48_000.0
+    for points in (1, 3, 20, 99, 200):
+        curve = learning_curve(tmp_path, points)
+        assert curve is not None
+        assert len(curve["samples"]) <= points
+        assert (curve["samples"][-1], curve["episode_return"][-1]) == (100_000.0, 100.0)
     (tmp_path / "learning.csv").write_text("samples,train/episode_length\n1000,many\n")
     with pytest.raises(UserError, match=r"learning\.csv is damaged at line 2: could not convert string to float: 'many'"):
         learning_curve(tmp_path)
