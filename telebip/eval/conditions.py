@@ -10,9 +10,9 @@ def as_evaluated(
 ) -> TaskConfig:
     """Return a task whose robots start facing x and walk `duration` s without a time-out.
 
-    Unless `disturbed`, there are no pushes and no observation noise, and the ground has the friction of the MJCF. Extra reward
-    terms are left out: walking needs no rewards, and their functions need not be there.
+    `disturbed` ones keep the task's disturbances; else there are no pushes and no observation noise, and the ground has the
+    friction of the MJCF. Extra reward terms are left out: walking needs no rewards, and their functions need not be there.
     """
-    switches = [f"disturbance.{name}.enabled={str(disturbed).lower()}" for name in ("push", "friction", "noise")]
+    switches = [] if disturbed else [f"disturbance.{name}.enabled=false" for name in ("push", "friction", "noise")]
     start = [f"num_envs={num_envs}", f"episode.length={duration + 1.0}", "episode.reset_heading=0"]
     return load_task(config, [*start, *switches, "reward.extra={}", *overrides])
