@@ -83,6 +83,7 @@ def evaluate(
     progress: Progress = lambda name, step, total: None,
 ) -> dict[str, Any]:
     """Run suites and return the results: plain numbers, texts, lists and dictionaries. Deterministic for the task's seed."""
+    curve = learning_curve(subject.run_dir) if "learning" in suites and subject.run_dir else None  # first: it may be damaged
     results: dict[str, Any] = {
         "schema": "telebip-results-1",
         "label": subject.label,
@@ -105,7 +106,7 @@ def evaluate(
     if "push" in suites:
         results["push"] = _push(subject, robot, protocol, progress)
     if "learning" in suites:
-        results["learning"] = learning_curve(subject.run_dir) if subject.run_dir else None
+        results["learning"] = curve
     return results
 
 

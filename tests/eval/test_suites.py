@@ -177,6 +177,15 @@ def test_commands_keep_to_what_was_trained(subject: Subject) -> None:
     assert commands_of(subject, dataclasses.replace(PROTOCOL, commands=(0.2,))) == (0.2,)
 
 
+def test_a_damaged_learning_curve_is_named_before_anything_is_measured(subject: Subject, robot: Robot, tmp_path: Path) -> None:
+    (tmp_path / "learning.csv").write_text("nothing\n")
+    steps: list[int] = []
+    damaged = dataclasses.replace(subject, run_dir=tmp_path)
+    with pytest.raises(UserError, match=r"learning\.csv is damaged"):
+        evaluate(damaged, robot, SUITES, PROTOCOL, lambda name, step, total: steps.append(step))
+    assert steps == []
+
+
 def test_samples_to_a_share_of_the_final_value() -> None:
     samples = [float(i) for i in range(1, 31)]
     curve = [min(i / 10, 1.0) * 500.0 for i in range(30)]
