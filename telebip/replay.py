@@ -107,11 +107,16 @@ def replay(fault: Fault, backend: Backend | None = None) -> Replay:
     """Repeat the step of a fault on the CPU, on the engine that it happened on or on another.
 
     Physics steps are taken one by one; on `native` they are the same, bit for bit, as those of the policy step.
+
+    Raises:
+        UserError: the configuration names another robot.
     """
     cfg, record = fault.config, fault.record
     robot = load_robot(cfg.sim.robot)
     capacity = cfg.sim.max_contacts, cfg.sim.max_constraints
     sim = make_simulator(backend or fault.backend, robot, 1, 1, torch.device("cpu"), MODEL_FIELDS, capacity)
+    if any(record[name].shape != value.shape[1:] for name, value in {**sim.model_fields, **sim.memory}.items()):
+        raise UserError(f"the fault is of another robot than '{cfg.sim.robot}'")
     for name, field in sim.model_fields.items():
         field.copy_(record[name])
     sim.load({name: record[name][None] for name in sim.memory})

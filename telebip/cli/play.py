@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from telebip.cli.common import CONTROLLERS, Parser, open_checkpoint, resolve_device
@@ -38,9 +39,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         task, config = checkpoint.task, checkpoint.config
     else:
         task, config = Path(options.task).stem, load_task(options.task)
-    command = _command(options.command, config)
     overrides = [*([] if options.seed is None else [f"seed={options.seed}"]), *options.overrides]
     config = as_evaluated(config, options.num_envs, options.duration, overrides, disturbed=options.disturb)
+    command = _command(options.command, config)
     _play(options, task, config, command, checkpoint)
 
 
@@ -93,6 +94,7 @@ def _replay(options: argparse.Namespace) -> None:
 
     console = Console(highlight=False, soft_wrap=True)
     fault = load_fault(options.replay)
+    fault = replace(fault, config=load_task(fault.config, options.overrides))
     backend = fault.backend if options.backend == "auto" else options.backend
     done = replay(fault, backend)
     console.print(f"{options.replay}: {fault.kind}, {describe(fault.record)}, on {fault.backend}; repeated on {backend}")
@@ -197,6 +199,22 @@ def _warn_untrained(console, command: tuple[float, float, float], checkpoint) ->
             console.print(f"note: {name} {value:g} lies outside what this policy was trained on, [{low:g}, {high:g}]")
 
 
+def _check_replay(parser: Parser, options: argparse.Namespace) -> None:
+    """Refuse what cannot change the step of a dumped fault.
+
+    Raises:
+        UserError: there is something.
+    """
+    if options.viewer == "mujoco":
+        raise UserError("a --replay is five poses; look at them with --viewer rerun or --record")
+    for name in ("beside", "command", "disturb", "duration", "num_envs", "seed", "task"):
+        if getattr(options, name) != parser.get_default(name):
+            raise UserError(f"a --replay repeats the step as it was; leave out --{name.replace('_', '-')}")
+    for override in options.overrides:
+        if not override.startswith("sim.robot="):
+            raise UserError(f"a --replay repeats the step as it was; of overrides it takes sim.robot=FILE, not '{override}'")
+
+
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = Parser("Walk a policy at a given command, measure it, and record it for the rerun viewer.", EXAMPLES)
     who = parser.add_mutually_exclusive_group()
@@ -253,8 +271,11 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         raise UserError(f"--record writes one of FILE{', FILE'.join(SUFFIXES)}, got '{options.record}'")
     if options.show < 1:
         raise UserError(f"--show must be at least 1, got {options.show}")
-    if options.replay and options.viewer == "mujoco":
-        raise UserError("a --replay is five poses; look at them with --viewer rerun or --record")
+    if options.replay:
+        _check_replay(parser, options)
+    for name in ("record", "beside"):
+        if options.viewer == "mujoco" and getattr(options, name):
+            raise UserError(f"--viewer mujoco shows one walker, and records nothing; leave out --{name}")
     if options.connect and options.viewer != "rerun":
         raise UserError("--connect names a rerun viewer; it goes with --viewer rerun")
     return options

@@ -62,6 +62,11 @@ LONG = 300 * "a"
         ([GALLERY, "--only", "stride.png", "--out", "README.md"], ["cannot write to folder 'README.md'"]),
         ([PLAY, "--agent", "zero", "--show", "0"], ["--show", "at least 1"]),
         ([PLAY, "--agent", "zero", "--connect", "localhost"], ["--connect", "--viewer rerun"]),
+        ([PLAY, "--agent", "zero", "--viewer", "mujoco", "--record", "f.mp4"], ["--viewer mujoco", "leave out --record"]),
+        ([PLAY, "--agent", "zero", "--viewer", "mujoco", "--beside", "dcm"], ["--viewer mujoco", "leave out --beside"]),
+        ([PLAY, "--replay", "f.pt", "--beside", "dcm"], ["--replay", "leave out --beside"]),
+        ([PLAY, "--replay", "f.pt", "--num-envs", "8"], ["--replay", "leave out --num-envs"]),
+        ([PLAY, "--replay", "f.pt", "gait.period=1"], ["--replay", "sim.robot=FILE", "'gait.period=1'"]),
         ([PLAY, "--agent", "zero", "--viewer", "mujco"], ["--viewer", "mujco", "mujoco"]),
     ],
     ids=lambda value: " ".join(value[1:]) if value[0] in (TRAIN, PLAY, GALLERY) else "",
@@ -152,6 +157,11 @@ def test_a_model_based_walker_can_be_played() -> None:
     assert "controller 'alip': telebip_flat, 1 world x 1 s" in text
 
 
+def test_the_default_command_is_the_middle_of_overridden_ranges() -> None:
+    text = ran(PLAY, "--agent", "zero", "--duration", "0.1", "--device", "cpu", "command.lin_vel_x=[0.2,0.4]")
+    assert "0.30 m/s forward" in text
+
+
 def test_a_run_goes_on_in_its_folder(run_dir: Path) -> None:
     ran(TRAIN, "--resume", str(run_dir), "--max-iterations", "3", "--device", "cpu")
     assert (run_dir / "model_3.pt").is_file()
@@ -199,4 +209,11 @@ def test_a_dumped_fault_is_repeated_and_recorded(tmp_path: Path) -> None:
     assert "non_finite_state, world 2, environment step 1, on native; repeated on native" in printed
     assert printed.splitlines()[-2] == "reproduced"
     assert (tmp_path / "fault.rrd").stat().st_size > 0
+    own = tmp_path / "own.xml"
+    own.write_text((ROOT / "assets" / "telebip.xml").read_text())
+    assert ran(PLAY, "--replay", str(fault), f"sim.robot={own}").splitlines()[-1] == "reproduced"
+    other = tmp_path / "other.xml"
+    other.write_text(own.read_text().replace("</worldbody>", '<geom name="more" size="0.1" pos="9 9 9"/></worldbody>'))
+    assert f"the fault is of another robot than '{other}'" in refusal(PLAY, "--replay", str(fault), f"sim.robot={other}")
+    assert "robot file" in refusal(PLAY, "--replay", str(fault), "sim.robot=nowhere.xml")
     assert "this version reads 'telebip-fault-1'" in refusal(PLAY, "--replay", "assets/policies/telebip_flat/policy.pt")
