@@ -1,6 +1,7 @@
 """`evaluate.py`: measure what walks, and report it."""
 
 import argparse
+import math
 from collections.abc import Sequence
 from contextlib import contextmanager
 from hashlib import sha256
@@ -135,9 +136,17 @@ def progress_bar(console):
         yield show
 
 
+def speed(text: str) -> float:
+    """Read a finite number; argparse turns a ValueError into a refusal that quotes the text."""
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(text)
+    return value
+
+
 def speeds(text: str) -> tuple[float, ...]:
-    """Read `0.5,0.7`; argparse turns a ValueError into a refusal that quotes the text."""
-    return tuple(float(part) for part in text.split(","))
+    """Read `0.5,0.7`, as `speed` reads one."""
+    return tuple(speed(part) for part in text.split(","))
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:

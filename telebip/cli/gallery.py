@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from telebip import ROOT
 from telebip.cli.common import Parser, open_checkpoint
+from telebip.cli.evaluate import speed
 from telebip.errors import UserError, nearest
 from telebip.viz.opengl import choose_opengl
 
@@ -32,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Parse arguments and draw."""
     parser = Parser("Make the pictures of walkers in README and docs anew, from the shipped policy.", EXAMPLES)
     parser.add_argument("--checkpoint", metavar="PATH_OR_RUN", default=str(ROOT / "assets" / "policies" / "telebip_efficient"))
-    parser.add_argument("--command", nargs=3, type=float, metavar=("VX", "VY", "WZ"), default=(0.7, 0.0, 0.0))
+    parser.add_argument("--command", nargs=3, type=speed, metavar=("VX", "VY", "WZ"), default=(0.7, 0.0, 0.0))
     parser.add_argument("--out", metavar="DIR", type=Path, default=ROOT / "docs" / "images", help="default: docs/images")
     parser.add_argument("--only", nargs="+", metavar="PICTURE", help=f"of {', '.join(PICTURES)} (default: all)")
     options = parser.parse(argv)

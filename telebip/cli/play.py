@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from telebip.cli.common import CONTROLLERS, Parser, open_checkpoint, resolve_device
+from telebip.cli.evaluate import speed
 from telebip.config import TaskConfig, load_task
 from telebip.control.config import split_overrides
 from telebip.errors import UserError
@@ -236,7 +237,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--command",
         nargs=3,
-        type=float,
+        type=speed,
         metavar=("VX", "VY", "WZ"),
         help="m/s forward, m/s left, rad/s (default: the middle of the task's ranges)",
     )

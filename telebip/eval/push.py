@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from telebip.control.policy import Policy
 from telebip.env import TelebipEnv
-from telebip.eval.rollout import require_capacity
+from telebip.eval.rollout import judge_faults
 from telebip.mdp.randomization import uniform
 
 DIRECTIONS = {"forward": (1.0, 0.0), "backward": (-1.0, 0.0), "left": (0.0, 1.0), "right": (0.0, -1.0)}
@@ -121,5 +121,5 @@ def push_trial(
             walked = max(0.0, (step + 1) * env.step_dt - protocol.warmup)
             survival = torch.where(dones & survival.isinf(), walked, survival)
             progress(step + 1)
-    require_capacity(env)
+    judge_faults(env)
     return survival.reshape(shape).cpu().numpy()

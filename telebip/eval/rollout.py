@@ -1,6 +1,7 @@
 """Walk a policy and keep what happened, as plain arrays for measuring, plotting and recording."""
 
 import dataclasses
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -88,12 +89,20 @@ def roll_out(env: TelebipEnv, policy: Policy, steps: int, progress: Callable[[in
             rows.append({name: value.clone() for name, value in row.items()})
             rows[-1] |= {"command": command, "reward": reward, "fallen": dones & ~extras["time_outs"]}
             progress(step + 1)
-    require_capacity(env)
+    judge_faults(env)
     arrays = {name: torch.stack([row[name] for row in rows]).cpu().numpy() for name in rows[0]}
     return Rollout(step_dt=env.step_dt, weight=env.robot.weight, reward_names=env.reward_names, **arrays)
 
 
-def require_capacity(env: TelebipEnv) -> None:
-    """Raise a `UserError` if the engine had no room for a world's contacts or constraints: what it then did is no physics."""
-    if "capacity" in env.take_faults():
+def judge_faults(env: TelebipEnv) -> None:
+    """Say on standard error which kinds of faults there were (`telebip.mdp.faults`): their worlds count as fallen.
+
+    Raises:
+        UserError: the engine had no room for a world's contacts or constraints; what it then did is no physics.
+    """
+    faults = env.take_faults()
+    if "capacity" in faults:
         raise UserError(f"contacts or constraints did not fit; {env.sim.advice['capacity']}")
+    if faults:
+        first = ", ".join(f"{kind} (first at step {int(record['step'])})" for kind, record in faults.items())
+        print(f"note: worlds count as fallen because of {first}", file=sys.stderr)

@@ -64,6 +64,7 @@ LONG = 300 * "a"
         ([PLAY, "--agent", "zero", "--connect", "localhost"], ["--connect", "--viewer rerun"]),
         ([PLAY, "--agent", "zero", "--viewer", "mujoco", "--record", "f.mp4"], ["--viewer mujoco", "leave out --record"]),
         ([PLAY, "--agent", "zero", "--viewer", "mujoco", "--beside", "dcm"], ["--viewer mujoco", "leave out --beside"]),
+        ([PLAY, "--agent", "zero", "--command", "0.5", "nan", "0"], ["--command", "invalid speed value: 'nan'"]),
         ([PLAY, "--replay", "f.pt", "--beside", "dcm"], ["--replay", "leave out --beside"]),
         ([PLAY, "--replay", "f.pt", "--num-envs", "8"], ["--replay", "leave out --num-envs"]),
         ([PLAY, "--replay", "f.pt", "gait.period=1"], ["--replay", "sim.robot=FILE", "'gait.period=1'"]),

@@ -38,6 +38,7 @@ def test_evaluate_measures_a_model_based_walker_at_the_physics_rate(tmp_path: Pa
         ([EVALUATE, "--checkpoint", "nowhere"], "checkpoint 'nowhere' does not exist"),
         ([EVALUATE, "--checkpoint", "assets/policies/telebip_flat", "--suite", "pusj"], "did you mean 'push'?"),
         ([EVALUATE, "--controller", "dcm", "--commands", "0.5;0.7"], "invalid speeds value: '0.5;0.7'"),
+        ([EVALUATE, "--controller", "dcm", "--commands", "0.5,inf"], "invalid speeds value: '0.5,inf'"),
         ([EVALUATE, "--checkpoint", "assets/policies/telebip_flat", "--num-envs", "0"], "--num-envs must be between 1"),
         ([EVALUATE, "--checkpoint", "assets/policies/telebip_flat", "--out", "/proc/x"], "cannot write to folder '/proc/x'"),
         ([EVALUATE, "--controller", "dcm", "num_envs=99"], "'num_envs=99' cannot be overridden here; use --num-envs"),
