@@ -33,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
     console = Console(highlight=False, soft_wrap=True)
     with console.status("loading torch and the physics engine"):
-        from telebip.eval.report import make_folder, read_results, write_report
+        from telebip.eval.report import make_folder, write_report
         from telebip.eval.study import BASELINES, TRAININGS
     names = [walker.name for walker in (*TRAININGS, *BASELINES)]
     for name in options.only:
@@ -55,17 +55,31 @@ def main(argv: Sequence[str] | None = None) -> None:
         if not options.only or baseline.name in options.only:
             subject = controller_subject(baseline.controller, baseline.label, baseline.overrides)
             _measure(console, out / baseline.name, baseline, options, subject)
-    results = {name: [read_results(file) for file in _measured(out, name)] for name in names}
+    results = {name: [_read(file) for file in _measured(out, name, seeds=not options.shipped)] for name in names}
     seeds = [f"{t.label} ({n} seed{'s' if n > 1 else ''})" for t in TRAININGS if (n := len(results[t.name]))]
     text = INTRODUCTION.format(trainings=", ".join(seeds) or "none")
     write_report([one for each in results.values() for one in each], out, "The study", text, references())
     console.print(f"wrote {out}/report.md and report.html, about {sum(map(bool, results.values()))} of {len(names)} walkers")
 
 
-def _measured(out: Path, name: str) -> list[Path]:
-    """Return the results of one walker that are there, of its first seed first."""
-    files = [out / name / "results.json", *sorted(out.glob(f"{name}-seed*/results.json"))]
+def _measured(out: Path, name: str, seeds: bool) -> list[Path]:
+    """Return the results of one walker that are there, of its first seed first, and of the other `seeds` if asked for."""
+    files = [out / name / "results.json", *(sorted(out.glob(f"{name}-seed*/results.json")) if seeds else ())]
     return [file for file in files if file.is_file()]
+
+
+def _read(file: Path):
+    """Return results that the report can show.
+
+    Raises:
+        UserError: they are not.
+    """
+    from telebip.eval.report import can_be_shown, read_results
+
+    results = read_results(file)
+    if not can_be_shown(results):
+        raise UserError(f"results '{file}' lack some of what the report shows; measure them again (--again), or delete them")
+    return results
 
 
 def _train(console, training, seed: int, options: argparse.Namespace) -> Path | None:
@@ -88,13 +102,13 @@ def _train(console, training, seed: int, options: argparse.Namespace) -> Path | 
 
 def _measure(console, out: Path, walker, options: argparse.Namespace, subject) -> None:
     """Measure one walker, unless complete results of the same policy or parameters, measured in the same way, are there."""
-    from telebip.eval.report import make_folder, read_results, write_results
-    from telebip.eval.suites import Protocol, evaluate, is_current
+    from telebip.eval.report import make_folder, write_results
+    from telebip.eval.suites import Protocol, evaluate
     from telebip.robot import load_robot
 
     protocol = _quick_protocol() if options.quick else Protocol(device=resolve_device(options.device))
     file = out / "results.json"
-    if file.is_file() and not options.again and is_current(read_results(file), subject, walker.suites, protocol):
+    if not options.again and _is_current(file, subject, walker.suites, protocol):
         console.print(f"{walker.name}: measured already")
         return
     make_folder(out)
@@ -102,6 +116,16 @@ def _measure(console, out: Path, walker, options: argparse.Namespace, subject) -
         results = evaluate(subject, load_robot(subject.config.sim.robot), walker.suites, protocol, show)
     write_results(results, out)
     console.print(f"{walker.name}: measured, see {file}")
+
+
+def _is_current(file: Path, subject, suites: Sequence[str], protocol) -> bool:
+    """Whether a file holds what would be measured again; a missing, damaged or older one does not."""
+    from telebip.eval.suites import is_current
+
+    try:
+        return file.is_file() and is_current(_read(file), subject, suites, protocol)
+    except UserError:
+        return False
 
 
 def _quick_protocol():

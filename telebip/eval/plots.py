@@ -42,6 +42,11 @@ def svg(figure: Figure) -> str:
     return text[text.index("<svg") :]
 
 
+def close(figure: Figure) -> None:
+    """Forget a figure that is not to be drawn."""
+    plt.close(figure)
+
+
 def color(index: int, label: str) -> str:
     """Colour of the method at a position of the whole list, the same in every plot: a grey for the article's own numbers."""
     return GREYS[index % len(GREYS)] if label.startswith("article") else COLORS[index % len(COLORS)]

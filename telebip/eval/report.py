@@ -62,6 +62,17 @@ def read_results(path: Path) -> Results:
     return results
 
 
+def can_be_shown(results: Results) -> bool:
+    """Whether results hold all that tables and pictures show of them, which older and damaged ones may not."""
+    try:
+        _tables([results])
+        for figure in (*(figure for _, figure in _comparisons([results], [])), *_portraits([results])):
+            plots.close(figure())
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError):
+        return False
+    return True
+
+
 def make_folder(out: Path) -> None:
     """Create the folder `out` and make sure, before the long work, that it can be written to.
 

@@ -131,11 +131,13 @@ def push_protocol_of(subject: Subject, protocol: Protocol) -> PushProtocol:
 def is_current(results: dict[str, Any], subject: Subject, suites: Sequence[str], protocol: Protocol) -> bool:
     """Whether results from a file are what `evaluate` would measure again: all of the suites, of the same, in the same way."""
     push = push_protocol_of(subject, protocol)
+    pushed = {**asdict(push), "horizons": list(push.horizons)}
     return (
         set(suites) <= results.keys()
-        and results["fingerprint"] == subject.fingerprint
-        and results["protocol"] == describe_protocol(subject, protocol)
-        and ("push" not in suites or results["push"]["protocol"] == {**asdict(push), "horizons": list(push.horizons)})
+        and all(results[suite] for suite in suites if suite != "learning")  # which may be null
+        and results.get("fingerprint") == subject.fingerprint
+        and results.get("protocol") == describe_protocol(subject, protocol)
+        and ("push" not in suites or results["push"].get("protocol") == pushed)
     )
 
 

@@ -74,6 +74,29 @@ def test_the_study_at_toy_size_goes_on_where_it_stopped(tmp_path: Path) -> None:
     assert results.stat().st_mtime_ns == written
 
 
+def test_results_that_lack_something_are_measured_again_or_named(tmp_path: Path) -> None:
+    where = ("--quick", "--device", "cpu", "--out", str(tmp_path), "--runs", str(tmp_path / "runs"), "--only", "dcm")
+    older = {"schema": "telebip-results-1", "label": "older", "push": None, "tracking": [{"command_mps": 0.5}]}
+    files = {name: tmp_path / name / "results.json" for name in ("dcm", "period_06")}
+    for file in files.values():
+        file.parent.mkdir()
+        file.write_text(json.dumps(older))
+    assert f"results '{files['period_06']}' lack some" in refusal(REPRODUCE, *where)
+    assert json.loads(files["dcm"].read_text())["label"] == "DCM"
+    files["period_06"].unlink()
+    assert "dcm: measured already" in ran(REPRODUCE, *where)
+    files["dcm"].write_text("{")
+    assert "dcm: measured, see" in ran(REPRODUCE, *where)
+
+
+def test_other_seeds_are_left_out_of_the_report_of_what_is_shipped(tmp_path: Path) -> None:
+    for name in ("period_06", "period_06-seed2"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "results.json").touch()
+    names = [[file.parent.name for file in reproduce._measured(tmp_path, "period_06", seeds)] for seeds in (False, True)]
+    assert names == [["period_06"], ["period_06", "period_06-seed2"]]
+
+
 def test_the_toy_study_keeps_apart_from_the_real_one() -> None:
     toy, real = reproduce._parse(["--quick"]), reproduce._parse([])
     assert (real.out, real.runs) == ("docs/results", "runs/study")

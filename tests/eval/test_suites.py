@@ -17,7 +17,7 @@ from telebip.errors import UserError
 from telebip.eval import plots
 from telebip.eval.learning import learning_curve, samples_to
 from telebip.eval.push import PushProtocol
-from telebip.eval.report import read_results, write_report, write_results
+from telebip.eval.report import can_be_shown, read_results, write_report, write_results
 from telebip.eval.suites import SUITES, Protocol, Subject, check_suites, commands_of, evaluate, is_current, make_env
 from telebip.robot import Robot
 
@@ -100,6 +100,19 @@ def test_results_are_current_for_the_same_subject_measured_in_the_same_way(
     assert not is_current(back, subject, SUITES, dataclasses.replace(PROTOCOL, push=PushProtocol()))
     assert not is_current(back, dataclasses.replace(subject, fingerprint="of another"), SUITES, PROTOCOL)
     assert not is_current({key: value for key, value in back.items() if key != "gait"}, subject, SUITES, PROTOCOL)
+
+
+def test_results_that_lack_something_are_not_current(results: dict[str, Any], subject: Subject) -> None:
+    for lacking in ({"push": None}, {"push": {}}, {"gait": None}, {"tracking": []}, {"protocol": None}):
+        assert not is_current(results | lacking, subject, SUITES, PROTOCOL)
+    assert not is_current({key: value for key, value in results.items() if key != "fingerprint"}, subject, SUITES, PROTOCOL)
+
+
+def test_results_that_lack_something_cannot_be_shown(results: dict[str, Any]) -> None:
+    assert can_be_shown(results)
+    lacks: list[dict[str, Any]] = [{"tracking": [{"command_mps": 0.5}]}, {"tracking": None}, {"series": {}}, {"gait": 1.0}]
+    for lacking in (*lacks, {"push": {"10s": {}}}, {"learning": {"samples": []}}):
+        assert not can_be_shown(results | lacking)
 
 
 def test_a_controller_is_told_by_its_parameters() -> None:
