@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         backend=options.backend,
     )
     robot = load_robot(subject.config.sim.robot)
-    out = Path(options.out or f"reports/{subject.label}")
+    out = Path(options.out) if options.out else default_folder(subject.label)
     make_folder(out)
     with progress_bar(console) as show:
         results = evaluate(subject, robot, suites, protocol, show)
@@ -60,6 +60,12 @@ def main(argv: Sequence[str] | None = None) -> None:
     lines = (out / "report.md").read_text(encoding="utf-8").splitlines()
     console.print("\n".join(line for line in lines if not line.startswith("![")), markup=False)
     console.print(f"wrote {out}/results.json, report.md with its pictures, and report.html")
+
+
+def default_folder(label: str) -> Path:
+    """Return where the report of this label goes: a folder in `reports`, whatever path a checkpoint's task or a user gives."""
+    name = Path(label).name
+    return Path("reports") / (name if name not in ("", "..") else "unnamed")
 
 
 def check_overrides(overrides: Sequence[str], suites: Sequence[str]) -> None:

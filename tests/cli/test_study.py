@@ -7,7 +7,7 @@ import pytest
 from processes import fresh
 from test_commands_line import ran, refusal
 
-from telebip.cli import reproduce
+from telebip.cli import evaluate, reproduce
 
 EVALUATE, REPRODUCE = "scripts/evaluate.py", "scripts/reproduce.py"
 SMALL = ("--num-envs", "2", "--duration", "2", "--device", "cpu")
@@ -29,6 +29,14 @@ def test_evaluate_measures_a_model_based_walker_at_the_physics_rate(tmp_path: Pa
     results = json.loads((tmp_path / "results.json").read_text())
     assert results["source"] == "evaluate.py --controller alip sim.decimation=1 control.swing_height=0.05"
     assert results["tracking"][0]["falls"] == 0
+
+
+@pytest.mark.parametrize(
+    ("label", "folder"),
+    [("flat", "flat"), ("RL, slow", "RL, slow"), ("../../out", "out"), ("/etc", "etc"), ("..", "unnamed"), ("/", "unnamed")],
+)
+def test_a_report_without_a_folder_stays_in_reports(label: str, folder: str) -> None:
+    assert evaluate.default_folder(label) == Path("reports", folder)
 
 
 @pytest.mark.parametrize(
