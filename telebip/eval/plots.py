@@ -47,6 +47,12 @@ def close(figure: Figure) -> None:
     plt.close(figure)
 
 
+def named(results: Results) -> str:
+    """Return the label as matplotlib shows it: `$` opens no formula, and a leading `_` does not hide it from legends."""
+    label = results["label"].replace("$", r"\$")
+    return f" {label}" if label.startswith("_") else label
+
+
 def color(index: int, label: str) -> str:
     """Colour of the method at a position of the whole list, the same in every plot: a grey for the article's own numbers."""
     return GREYS[index % len(GREYS)] if label.startswith("article") else COLORS[index % len(COLORS)]
@@ -62,7 +68,7 @@ def speed(results: Results) -> Figure:
             axes.plot(series["time_s"], series[name], color=COLORS[i % len(COLORS)], lw=1.4, label=f"{float(name):g} m/s")
             axes.axhline(float(name), color=COLORS[i % len(COLORS)], lw=0.9, ls=(0, (4, 3)))
         axes.axvspan(0, results["protocol"]["skip_s"], color="#f3f4f6", zorder=0)
-        axes.set(xlabel="time [s]", ylabel="speed [m/s]", title=f"{results['label']}: speed, and what was commanded (dashed)")
+        axes.set(xlabel="time [s]", ylabel="speed [m/s]", title=f"{named(results)}: speed, and what was commanded (dashed)")
         axes.set_xlim(0, series["time_s"][-1])
         axes.legend(ncols=len(commands), loc="lower right")
     return figure
@@ -81,7 +87,7 @@ def feet(results: Results) -> Figure:
         axes.plot(time, s["right_bw"], color=COLORS[0], lw=1.5, label="right foot")
         axes.plot(time, s["left_bw"], color=COLORS[1], lw=1.5, label="left foot")
         axes.set(xlabel="time [s]", ylabel="force [body weights]", ylim=(0, top))
-        axes.set_title(f"{results['label']}: forces on the feet at {s['command_mps']:g} m/s (shaded: whose turn it is)")
+        axes.set_title(f"{named(results)}: forces on the feet at {s['command_mps']:g} m/s (shaded: whose turn it is)")
         axes.set_xlim(time[0], time[-1])
         axes.legend(ncols=2, loc="upper right")
     return figure
@@ -102,7 +108,7 @@ def cost_of_transport(all_results: Sequence[Results], commands: Sequence[float] 
             results, costs = all_results[k], costs_of[k]
             x = [at + (i - 0.5 * (len(shown) - 1)) * width for at, command in enumerate(commands) if command in costs]
             y = [costs[command] for command in commands if command in costs]
-            bars = axes.bar(x, y, 0.92 * width, color=color(k, results["label"]), label=results["label"])
+            bars = axes.bar(x, y, 0.92 * width, color=color(k, results["label"]), label=named(results))
             axes.bar_label(bars, fmt="%.2f", fontsize=7, padding=1)
         axes.set_xticks(range(len(commands)), [f"{command:.1f} m/s" for command in commands])
         axes.grid(axis="x", visible=False)
@@ -121,7 +127,7 @@ def push(all_results: Sequence[Results], horizon: str = "10s") -> Figure:
         for i, (k, results) in enumerate(shown):
             x = [at + (i - 0.5 * (len(shown) - 1)) * width for at in range(3)]
             values = [results["push"][horizon][f"{name}_n"] for name in directions]
-            bars = axes.bar(x, values, 0.92 * width, color=color(k, results["label"]), label=results["label"])
+            bars = axes.bar(x, values, 0.92 * width, color=color(k, results["label"]), label=named(results))
             axes.bar_label(bars, fmt="%.0f", fontsize=7, padding=1)
         axes.set_xticks(range(3), ["forward", "backward", "lateral (worse side)"])
         axes.grid(axis="x", visible=False)
@@ -145,7 +151,7 @@ def joints(results: Results) -> Figure:
         axes.set_yticks(range(len(rows)), [f"{row['command_mps']:g} m/s" for row in rows])
         axes.invert_yaxis()
         axes.grid(axis="y", visible=False)
-        axes.set(xlabel="cost of transport [-]", title=f"{results['label']}: which actuator pays")
+        axes.set(xlabel="cost of transport [-]", title=f"{named(results)}: which actuator pays")
         axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=7)
     return figure
 
@@ -160,7 +166,7 @@ def learning(all_results: Sequence[Results]) -> Figure:
             samples = np.array(curve["samples"]) / 1e6
             for axes, name in ((left, "episode_length"), (right, "velocity_error_mps")):
                 values = np.array([np.nan if v is None else v for v in curve[name]], dtype=float)
-                axes.plot(samples, values, color=color(i, results["label"]), lw=1.4, label=results["label"])
+                axes.plot(samples, values, color=color(i, results["label"]), lw=1.4, label=named(results))
         left.set(xlabel="million samples", ylabel="policy steps", title="Length of training episodes")
         right.set(xlabel="million samples", ylabel="m/s", title="Velocity error in training")
         for axes in (left, right):

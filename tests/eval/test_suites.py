@@ -155,6 +155,18 @@ def test_who_falls_has_no_bar_in_the_cost_of_transport(results: dict[str, Any]) 
     assert figure.axes[0].get_legend_handles_labels()[1] == [results["label"]]
 
 
+def test_a_label_is_shown_as_it_is_written(results: dict[str, Any]) -> None:
+    odd = [results | {"label": label} for label in ("cost $a_$", "_hidden", "$_^{", "5 $")]
+    figure = plots.cost_of_transport(odd)
+    legend = figure.axes[0].get_legend()
+    assert legend is not None
+    assert [text.get_text() for text in legend.get_texts()] == [r"cost \$a_\$", " _hidden", r"\$_^{", r"5 \$"]
+    assert plots.svg(figure).startswith("<svg")
+    for one in odd:
+        for draw in (plots.speed, plots.feet, plots.joints):
+            assert plots.svg(draw(one)).startswith("<svg")
+
+
 def test_the_same_numbers_give_the_same_picture(results: dict[str, Any]) -> None:
     assert plots.svg(plots.cost_of_transport([results])) == plots.svg(plots.cost_of_transport([results]))
 
