@@ -2,8 +2,10 @@
 
 import argparse
 import math
+import shlex
 from collections.abc import Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 
@@ -16,6 +18,7 @@ EXAMPLES = """\
   evaluate.py --checkpoint runs/telebip_flat/2026-01-31_12-00-00 --suite tracking,gait
   evaluate.py --checkpoint assets/policies/telebip_flat --suite push --max-force 150
   evaluate.py --controller dcm control.step_time=0.2 sim.decimation=1
+  evaluate.py --controller alip --suite tracking --commands=-0.3,0.5        (with = before a negative number)
 """
 
 SET_HERE = {"num_envs": "--num-envs", "episode.length": "--duration"}
@@ -41,6 +44,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     else:
         subject = subject_of(options.checkpoint, options.label, options.overrides)
     push = PushProtocol(max_force=options.max_force, worlds=options.push_worlds)
+    subject = replace(subject, source=" ".join([subject.source, *options.given]))
     protocol = Protocol(
         worlds=options.num_envs,
         duration=options.duration,
@@ -95,7 +99,7 @@ def controller_subject(name: str, label: str | None, overrides: Sequence[str] = 
         config=config,
         make_policy=lambda env: make_controller(name, env, own),
         limited=False,
-        source=" ".join(["evaluate.py --controller", name, *overrides]),
+        source=shlex.join(["evaluate.py", "--controller", name, *overrides]),
         fingerprint=sha256(repr((name, load_controller(name, own), config.sim, config.action)).encode()).hexdigest()[:16],
         overrides=tuple(task),
     )
@@ -112,7 +116,7 @@ def subject_of(checkpoint_path: str, label: str | None, overrides: Sequence[str]
         config=load_task(checkpoint.config, overrides),
         make_policy=lambda env: load_policy(checkpoint, env.device),
         run_dir=checkpoint.path.parent,
-        source=" ".join(["evaluate.py --checkpoint", checkpoint_path, *overrides]),
+        source=shlex.join(["evaluate.py", "--checkpoint", checkpoint_path, *overrides]),
         fingerprint=sha256(checkpoint.path.read_bytes()).hexdigest()[:16],
         overrides=tuple(overrides),
     )
@@ -177,7 +181,8 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         "--commands",
         type=speeds,
         metavar="VX,VX",
-        help="forward speeds in m/s (default: 0.5,0.7,1.0,-0.3 as far as the policy was trained on them)",
+        help="forward speeds in m/s (default: 0.5,0.7,1.0,-0.3 as far as the policy was trained on them); "
+        "--commands=-0.3,0.5 where the first is negative",
     )
     parser.add_argument("--max-force", type=float, default=300.0, metavar="N", help="largest push tried in N (default: 300)")
     parser.add_argument("--push-worlds", type=int, default=32, metavar="N", help="worlds for each push (default: 32)")
@@ -198,4 +203,9 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         value = getattr(options, name)
         if not low <= value <= high:
             raise UserError(f"--{name.replace('_', '-')} must be between {low:g} and {high:g}, got {value:g}")
+    options.given = [
+        f"--{name.replace('_', '-')}={','.join(map(str, value)) if isinstance(value, tuple) else value}"
+        for name in ("suite", "num_envs", "duration", "commands", "max_force", "push_worlds", "backend")
+        if (value := getattr(options, name)) != parser.get_default(name)
+    ]
     return options

@@ -27,7 +27,10 @@ def test_evaluate_measures_a_model_based_walker_at_the_physics_rate(tmp_path: Pa
     suite, overrides = ("--suite", "tracking", "--commands", "0.5"), ("sim.decimation=1", "control.swing_height=0.05")
     ran(EVALUATE, "--controller", "alip", *suite, *SMALL, "--out", str(tmp_path), *overrides)
     results = json.loads((tmp_path / "results.json").read_text())
-    assert results["source"] == "evaluate.py --controller alip sim.decimation=1 control.swing_height=0.05"
+    assert results["source"] == (
+        "evaluate.py --controller alip sim.decimation=1 control.swing_height=0.05 "
+        "--suite=tracking --num-envs=2 --duration=2.0 --commands=0.5"
+    )
     assert results["tracking"][0]["falls"] == 0
 
 
@@ -64,6 +67,19 @@ def test_a_report_without_a_folder_stays_in_reports(label: str, folder: str) -> 
 )
 def test_a_mistake_is_one_line(arguments: list[str], named: str) -> None:
     assert named in refusal(*arguments)
+
+
+def test_the_options_that_differ_from_the_defaults_measure_it_again() -> None:
+    assert evaluate._parse(["--controller", "dcm"]).given == []
+    options = evaluate._parse(["--controller", "dcm", "--commands=-0.3,0.5", "--max-force", "150", "--device", "cpu"])
+    assert options.given == ["--commands=-0.3,0.5", "--max-force=150.0"]
+    again = evaluate._parse(["--controller", "dcm", *options.given])
+    assert (again.commands, again.max_force) == ((-0.3, 0.5), 150.0)
+
+
+def test_a_command_with_spaces_and_brackets_can_be_pasted() -> None:
+    subject = evaluate.controller_subject("dcm", None, ["command.lin_vel_x=[0.2, 0.4]"])
+    assert subject.source == "evaluate.py --controller dcm 'command.lin_vel_x=[0.2, 0.4]'"
 
 
 def test_the_study_at_toy_size_goes_on_where_it_stopped(tmp_path: Path) -> None:
