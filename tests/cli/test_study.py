@@ -1,6 +1,8 @@
 """`evaluate.py` and `reproduce.py` as a user runs them."""
 
+import io
 import json
+import sys
 from pathlib import Path
 
 import pytest
@@ -80,6 +82,14 @@ def test_the_options_that_differ_from_the_defaults_measure_it_again() -> None:
 def test_a_command_with_spaces_and_brackets_can_be_pasted() -> None:
     subject = evaluate.controller_subject("dcm", None, ["command.lin_vel_x=[0.2, 0.4]"])
     assert subject.source == "evaluate.py --controller dcm 'command.lin_vel_x=[0.2, 0.4]'"
+
+
+def test_signs_that_the_terminal_lacks_stop_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    stdout = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr(sys, "stdout", stdout)
+    evaluate.open_console().print("0.676 ± 0.012 m/s")
+    stdout.flush()
+    assert stdout.buffer.getvalue() == b"0.676 ? 0.012 m/s\n"
 
 
 def test_the_study_at_toy_size_goes_on_where_it_stopped(tmp_path: Path) -> None:
