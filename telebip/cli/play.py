@@ -252,7 +252,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         "overrides",
         nargs="*",
         metavar="key.path=value",
-        help="override any field of the task, or control.key of a --controller",
+        help="override any field of the task, or control.key of a --controller; of a --replay, sim.robot alone",
     )
     options = parser.parse(argv)
     if not (options.checkpoint or options.controller or options.agent or options.replay):
