@@ -20,6 +20,8 @@ from telebip.robot import Robot, load_robot
 from telebip.sim import Backend, SimState, make_simulator
 
 FORMAT = "telebip-fault-1"
+RECORD = {"step", "world", "action", "push_wrench_w", "time", "qpos", "qvel", "qacc_warmstart", *MODEL_FIELDS}
+"""What a fault's record holds at least: all that the outcome of a step depends on."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +102,12 @@ def load_fault(path: str | Path) -> Fault:
     content = load_archive(Path(path), "fault", FORMAT)
     if content.get("kind") not in KINDS:
         raise UserError(f"fault '{path}': this version knows no '{content.get('kind')}'")
-    return Fault(content["kind"], parse_config(content["config"], f"{path}:config"), content["backend"], content["record"])
+    record = content.get("record")
+    if not (isinstance(record, dict) and record.keys() >= RECORD and all(isinstance(x, Tensor) for x in record.values())):
+        raise UserError(f"fault '{path}' is not complete: of the step's beginning it lacks something")
+    if content.get("backend") not in ("native", "warp") or not isinstance(content.get("config"), str):
+        raise UserError(f"fault '{path}' is not complete: it lacks its engine or its configuration")
+    return Fault(content["kind"], parse_config(content["config"], f"{path}:config"), content["backend"], record)
 
 
 def replay(fault: Fault, backend: Backend | None = None) -> Replay:

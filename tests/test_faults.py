@@ -224,3 +224,16 @@ def test_a_damaged_fault_is_refused(make_env: MakeEnv, tmp_path: Path) -> None:
     path.write_bytes(content)
     with pytest.raises(DamagedArchiveError, match="a checksum is wrong"):
         load_fault(path)
+
+
+@pytest.mark.parametrize("missing", ["record", "backend", "config", "action", "qpos"])
+def test_an_incomplete_fault_is_refused(make_env: MakeEnv, tmp_path: Path, missing: str) -> None:
+    env = make_env()
+    env.step(torch.full((4, 6), torch.nan))
+    file = save_fault(tmp_path, "non_finite_action", env.take_faults()["non_finite_action"], "telebip_flat", env)
+    content = torch.load(file, weights_only=True)
+    for part in (content, content["record"]):
+        part.pop(missing, None)
+    torch.save(content, file)
+    with pytest.raises(UserError, match=r"non_finite_action.pt' is not complete: "):
+        load_fault(file)
