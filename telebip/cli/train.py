@@ -77,8 +77,7 @@ def train(
     Returns:
         Whether all iterations are done.
     """
-    from rich.console import Console
-
+    from telebip.cli.console import Console
     from telebip.rl.distributed import Ranks, joined
 
     ranks = Ranks.from_environment()
@@ -174,7 +173,10 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
 
 @contextmanager
 def stop_on_signal(console):
-    """Yield a function that tells whether to stop: one Ctrl-C ends the run after its iteration, a second one at once."""
+    """Yield a function that tells whether to stop: one Ctrl-C ends the run after its iteration, a second one at once.
+
+    So do SIGTERM and, as a terminal that is closed sends it, SIGHUP; not where `nohup` has said to ignore that.
+    """
     asked = False
 
     def handle(signum: int, frame: object) -> None:
@@ -184,7 +186,10 @@ def stop_on_signal(console):
         asked = True
         console.print("stopping after this iteration with a checkpoint (press Ctrl-C again to leave at once)")
 
-    previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
+        numbers.append(signal.SIGHUP)
+    previous = {number: signal.signal(number, handle) for number in numbers}
     try:
         yield lambda: asked
     finally:

@@ -188,12 +188,45 @@ def test_two_interrupts_leave_at_once_and_without_damage(tmp_path: Path) -> None
     assert load_checkpoint(folder).damaged == ()
 
 
-def test_one_interrupt_finishes_the_iteration_and_saves_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_one_interrupt_finishes_the_iteration_and_saves_it(tmp_path: Path, number: signal.Signals) -> None:
     training = Training(tmp_path, *new(tmp_path, 100_000))
     folder = await_checkpoint(training, tmp_path)
-    training.send(signal.SIGINT)
+    training.send(number)
     output = training.finish()
     assert f"stopped after iteration {load_checkpoint(folder).iteration} of 100000" in output
+    assert len(curve(folder)) == 1 + load_checkpoint(folder).iteration
+
+
+def ignore_hangups() -> None:
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+
+
+def test_a_training_under_nohup_outlives_its_terminal(tmp_path: Path) -> None:
+    training = Training(tmp_path, *new(tmp_path, 30), before=ignore_hangups)
+    folder = await_checkpoint(training, tmp_path)
+    training.send(signal.SIGHUP)
+    training.finish()
+    assert load_checkpoint(folder).iteration == 30
+
+
+def lose_the_reader() -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    os.dup2(writer, 1)
+
+
+def fill_the_disk() -> None:
+    os.dup2(os.open("/dev/full", os.O_WRONLY), 1)
+
+
+@pytest.mark.parametrize("before", [lose_the_reader, fill_the_disk])
+def test_a_training_outlives_the_reader_of_its_output(tmp_path: Path, before: Callable[[], None]) -> None:
+    """As in `train.py | head`, and in `train.py | tee log` after a Ctrl-C, which ends `tee` first."""
+    training = Training(tmp_path, *new(tmp_path, 100_000), before=before)
+    folder = await_checkpoint(training, tmp_path)
+    training.send(signal.SIGINT)
+    assert training.finish() == ""
     assert len(curve(folder)) == 1 + load_checkpoint(folder).iteration
 
 
