@@ -39,12 +39,12 @@ def main(argv: Sequence[str] | None = None) -> None:
 
     if options.resume:
         checkpoint = open_checkpoint(options.resume)
-        if options.task and options.task != checkpoint.task:
+        if options.task and Path(options.task).stem != checkpoint.task:
             raise UserError(f"checkpoint '{checkpoint.path}' is of task '{checkpoint.task}', not of '{options.task}'")
         if "optimizer_state_dict" not in checkpoint.learner:
             raise UserError(f"checkpoint '{checkpoint.path}' holds the policy alone; resume from a model_<iteration>.pt")
         task, config = checkpoint.task, load_task(checkpoint.config, overrides)
-        run_dir: str | Path = checkpoint.path.parent
+        run_dir: str | Path = checkpoint.path.resolve().parent
     elif options.task:
         checkpoint, task, config, run_dir = None, Path(options.task).stem, load_task(options.task, overrides), options.log_dir
     else:
@@ -84,7 +84,7 @@ def train(
     console = Console(highlight=False, soft_wrap=True, quiet=not ranks.is_main)
     with console.status("loading torch and the physics engine"):
         from telebip.env import TelebipEnv
-        from telebip.rl.checkpoint import set_aside_newer
+        from telebip.rl.checkpoint import require_unchanged, set_aside_newer
         from telebip.rl.process import prepare_cpu
         from telebip.rl.run import create_run_dir, describe_run, exclusive, require_space
         from telebip.rl.train import Trainer
@@ -105,6 +105,7 @@ def train(
             if ranks.is_main:
                 run_dir = folder if isinstance(folder, Path) else create_run_dir(Path(folder), task)
                 stack.enter_context(exclusive(run_dir))
+                require_unchanged(run_dir, checkpoint)
             trainer = Trainer(env, task, run_dir, ranks, note=lambda line: console.print(f"note: {line}"))
         restart = trainer.resume(checkpoint) if checkpoint else ""
         total = config.ppo.max_iterations

@@ -39,6 +39,7 @@ class Checkpoint:
     training: list[dict[str, Any]] = field(default_factory=list)  # of each process: its worlds, generators and statistics
     robot: dict[str, list[float]] = field(default_factory=dict)  # what `robot_properties` said of the robot trained on
     damaged: tuple[str, ...] = ()  # newer checkpoints of the same folder that could not be read: why, a line each
+    beside: tuple[int, ...] = ()  # iterations of all checkpoints that its folder had when it was loaded
 
     @property
     def is_onnx(self) -> bool:
@@ -82,23 +83,35 @@ def prune_checkpoints(run_dir: Path, keep: int) -> None:
         file.unlink(missing_ok=True)
 
 
+def require_unchanged(run_dir: Path, checkpoint: Checkpoint | None) -> None:
+    """Refuse to go on in a folder that another process has trained in since `checkpoint` was loaded from it, or not found.
+
+    Raises:
+        UserError: it has.
+    """
+    new = _numbered(run_dir).keys() - set(checkpoint.beside if checkpoint else ())
+    if new:
+        raise UserError(f"another process has trained in '{run_dir}' meanwhile, up to iteration {max(new)}; start again")
+
+
 def set_aside_newer(run_dir: Path, iteration: int) -> list[Path]:
     """Move a run folder's checkpoints from after `iteration` to its folder `set_aside`, and return where they are now.
 
-    A run that goes on from an earlier checkpoint is another one from there on; "the newest" must mean its own.
+    Where that has some of their names already, they go to `set_aside_2`, and so on: nothing is overwritten. A run that goes on
+    from an earlier checkpoint is another one from there on; "the newest" must mean its own.
 
     Raises:
         UserError: they cannot be moved.
     """
-    moved = []
+    newer = [file for number, file in _numbered(run_dir).items() if number > iteration]
+    folders = (run_dir / name for name in ("set_aside", *(f"set_aside_{i}" for i in range(2, 1000))))
+    folder = next(folder for folder in folders if not any((folder / file.name).exists() for file in newer))
     try:
-        for number, file in _numbered(run_dir).items():
-            if number > iteration:
-                (run_dir / "set_aside").mkdir(exist_ok=True)
-                moved.append(file.replace(run_dir / "set_aside" / file.name))
+        if newer:
+            folder.mkdir(exist_ok=True)
+        return [file.replace(folder / file.name) for file in newer]
     except OSError as error:
         raise UserError(f"cannot write to run folder '{run_dir}': {error.strerror or error}") from error
-    return moved
 
 
 def load_checkpoint(path: str | Path) -> Checkpoint:
@@ -111,10 +124,12 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
         UserError: there is none, it is damaged or unsafe, or its observations or actions are laid out differently.
     """
     damaged: list[str] = []
-    candidates = _find(Path(path))
+    beside = tuple(_numbered(_find(Path(path))[0].resolve().parent))
+    candidates = _find(Path(path))  # after that, so that a checkpoint written meanwhile is noticed
     for file in candidates:
         try:
-            return replace(_load_onnx(file) if file.suffix == ".onnx" else _load_file(file), damaged=tuple(damaged))
+            checkpoint = _load_onnx(file) if file.suffix == ".onnx" else _load_file(file)
+            return replace(checkpoint, damaged=tuple(damaged), beside=beside)
         except DamagedArchiveError as error:
             if len(candidates) == 1:
                 raise

@@ -173,6 +173,13 @@ def test_a_run_goes_on_in_its_folder(run_dir: Path) -> None:
     assert "max_iterations: 3" in (run_dir / "config.yaml").read_text()
 
 
+def test_a_run_goes_on_with_its_task_by_name_or_by_file_and_no_other(run_dir: Path) -> None:
+    for task in ("telebip_slow", "configs/telebip_slow.yaml"):
+        assert "has finished" in ran(TRAIN, "--resume", str(run_dir), "--max-iterations", "1", "--task", task)
+    other = refusal(TRAIN, "--resume", str(run_dir), "--task", "telebip_flat")
+    assert "is of task 'telebip_slow', not of 'telebip_flat'" in other
+
+
 def test_an_interrupted_run_ends_well_and_leaves_a_checkpoint(tmp_path: Path) -> None:
     arguments = ["--task", "telebip_flat", "--max-iterations", "100000", "--log-dir", str(tmp_path), *TINY]
     with subprocess.Popen(

@@ -2,6 +2,7 @@
 
 import os
 import random
+import shutil
 import signal
 import sys
 import time
@@ -240,6 +241,48 @@ def test_going_on_from_an_earlier_checkpoint_sets_the_later_ones_aside(tmp_path:
     assert [file.name for file in folder.glob("model_*.pt")] == ["model_5.pt"]
     assert load_checkpoint(folder).iteration == 5
     assert [row[0] for row in curve(folder)[1:]] == ["1", "2", "3", "4", "5"]
+
+
+def test_what_was_set_aside_stays_when_more_is(tmp_path: Path) -> None:
+    Training(tmp_path, *new(tmp_path, 6)).finish()
+    folder = run_dir(tmp_path)
+    first = (folder / "model_6.pt").read_bytes()
+    for target in (6, 5):
+        Training(tmp_path, *resumed(folder / "model_4.pt", target)).finish()
+    assert (folder / "set_aside" / "model_6.pt").read_bytes() == first
+    assert load_checkpoint(folder / "set_aside_2" / "model_6.pt").iteration == 6
+
+
+def test_a_link_to_a_checkpoint_goes_on_in_the_runs_own_folder(tmp_path: Path) -> None:
+    Training(tmp_path, *new(tmp_path, 2)).finish()
+    folder, link = run_dir(tmp_path), tmp_path / "mine" / "start.pt"
+    link.parent.mkdir()
+    link.symlink_to(folder / "model_2.pt")
+    Training(tmp_path, *resumed(link, 3)).finish()
+    assert load_checkpoint(folder).iteration == 3
+    assert [*link.parent.iterdir()] == [link]
+
+
+def train_meanwhile() -> None:
+    """Let another process save a checkpoint before this one has the run for itself."""
+    import telebip.rl.run
+
+    exclusive = telebip.rl.run.exclusive
+
+    def late(folder: Path):
+        shutil.copy(folder / "model_2.pt", folder / "model_4.pt")
+        return exclusive(folder)
+
+    telebip.rl.run.exclusive = late
+
+
+def test_a_run_that_has_gone_on_since_its_checkpoint_was_loaded_is_left_alone(tmp_path: Path) -> None:
+    Training(tmp_path, *new(tmp_path, 2)).finish()
+    folder = run_dir(tmp_path)
+    late = Training(tmp_path, *resumed(folder, 6), before=train_meanwhile)
+    assert late.wait() == 2
+    assert f"another process has trained in '{folder}' meanwhile, up to iteration 4; start again" in late.output
+    assert {file.name for file in folder.glob("model_*.pt")} == {"model_2.pt", "model_4.pt"}
 
 
 def test_two_processes_do_not_train_in_one_folder(tmp_path: Path) -> None:
