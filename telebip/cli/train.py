@@ -85,8 +85,9 @@ def train(
     with console.status("loading torch and the physics engine"):
         from telebip.env import TelebipEnv
         from telebip.rl.checkpoint import require_unchanged, set_aside_newer
+        from telebip.rl.curve import rows_so_far
         from telebip.rl.process import prepare_cpu
-        from telebip.rl.run import create_run_dir, describe_run, exclusive, require_space
+        from telebip.rl.run import create_run_dir, describe_run, exclusive, read_starts, require_space
         from telebip.rl.train import Trainer
         from telebip.robot import load_robot
 
@@ -106,6 +107,8 @@ def train(
                 run_dir = folder if isinstance(folder, Path) else create_run_dir(Path(folder), task)
                 stack.enter_context(exclusive(run_dir))
                 require_unchanged(run_dir, checkpoint)
+                rows_so_far(run_dir)  # whole, or refused before anything is changed; so is the next
+                read_starts(run_dir)
             trainer = Trainer(env, task, run_dir, ranks, note=lambda line: console.print(f"note: {line}"))
         restart = trainer.resume(checkpoint) if checkpoint else ""
         total = config.ppo.max_iterations

@@ -18,7 +18,7 @@ class CurveWriter:
     def __init__(self, run_dir: Path, samples: int) -> None:
         """Open the file of `run_dir`, keeping its rows up to `samples` environment steps."""
         self._path = run_dir / FILE
-        rows = read_curve(run_dir) if self._path.exists() else []
+        rows = rows_so_far(run_dir)
         self._columns: list[str] = []
         self._write([row for row in rows if row["samples"] <= samples])
 
@@ -47,29 +47,37 @@ def _text(value: float) -> str:
     return f"{value:.0f}" if float(value).is_integer() else f"{value:.6g}"
 
 
+def rows_so_far(run_dir: Path) -> list[dict[str, float]]:
+    """Return the rows of a run's `learning.csv`, as `read_curve` does; none where there is no such file."""
+    return read_curve(run_dir) if (run_dir / FILE).exists() else []
+
+
 def read_curve(run_dir: Path) -> list[dict[str, float]]:
     """Return the rows of a run's `learning.csv`; a last one that was not finished is left out.
 
     Raises:
-        OSError: there is no such file.
-        UserError: its lines are not all numbers under the first one's names, among them "samples".
+        FileNotFoundError: there is no such file.
+        UserError: it cannot be read, or its lines are not all numbers under the first one's names, among them "samples".
     """
     path = run_dir / FILE
     try:
         with path.open(newline="", encoding="utf-8") as file:
             finished = [line for line in file if line.endswith("\n")]
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
         raise UserError(f"{path} is damaged: {error}") from error
-    table = csv.reader(finished)
-    names = next(table, ["samples"])
-    if "samples" not in names:
-        raise UserError(f"{path} is damaged: its first line names no column 'samples'")
-    rows = []
-    for line in table:
-        try:
+    table, rows = csv.reader(finished), []
+    try:
+        names = next(table, ["samples"])
+        if "samples" not in names:
+            raise UserError(f"{path} is damaged: its first line names no column 'samples'")
+        for line in table:
             if len(line) != len(names):
                 raise ValueError(f"{len(line)} numbers under {len(names)} names")
             rows.append(dict(zip(names, map(float, line), strict=True)))
-        except ValueError as error:
-            raise UserError(f"{path} is damaged at line {table.line_num}: {error}") from error
+    except (ValueError, csv.Error) as error:
+        raise UserError(f"{path} is damaged at line {table.line_num}: {error}") from error
     return rows

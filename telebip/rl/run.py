@@ -42,7 +42,11 @@ def create_run_dir(log_dir: Path, task: str) -> Path:
 
 
 def describe_run(run_dir: Path, config: TaskConfig, device: str, backend: str, processes: int = 1) -> None:
-    """Write `config.yaml`, complete, and append this start's versions, git revision and command line to `run.json`."""
+    """Write `config.yaml`, complete, and append this start's versions, git revision and command line to `run.json`.
+
+    Raises:
+        UserError: `run.json` is damaged, or the folder cannot be written to.
+    """
     start = {
         "time": datetime.now().astimezone().isoformat(timespec="seconds"),
         "command": sys.argv,
@@ -51,13 +55,33 @@ def describe_run(run_dir: Path, config: TaskConfig, device: str, backend: str, p
         "processes": processes,
         **describe_code(),
     }
-    file = run_dir / "run.json"
+    starts = read_starts(run_dir)
     try:
-        starts = json.loads(file.read_text(encoding="utf-8"))["starts"] if file.exists() else []
-        write_atomically(file, (json.dumps({"starts": [*starts, start]}, indent=2) + "\n").encode())
+        write_atomically(run_dir / "run.json", (json.dumps({"starts": [*starts, start]}, indent=2) + "\n").encode())
         write_atomically(run_dir / "config.yaml", to_yaml(config).encode())
-    except (OSError, ValueError, KeyError) as error:
-        raise UserError(f"cannot write to run folder '{run_dir}': {error}") from error
+    except OSError as error:
+        raise UserError(f"cannot write to run folder '{run_dir}': {error.strerror or error}") from error
+
+
+def read_starts(run_dir: Path) -> list[dict[str, Any]]:
+    """Return what `describe_run` has noted down in a run's `run.json`; nothing where there is no such file.
+
+    Raises:
+        UserError: it cannot be read, or holds something else.
+    """
+    file = run_dir / "run.json"
+    if not file.exists():
+        return []
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UserError(f"cannot read {file}: {error.strerror or error}") from error
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{file} is damaged: {error}; move it away to go on without it") from error
+    starts = content.get("starts") if isinstance(content, dict) else None
+    if not isinstance(starts, list):
+        raise UserError(f"{file} is damaged: it holds no list 'starts'; move it away to go on without it")
+    return starts
 
 
 @contextmanager

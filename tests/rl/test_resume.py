@@ -92,6 +92,14 @@ def await_checkpoint(training: Training, log_dir: Path) -> Path:
     return run_dir(log_dir)
 
 
+@pytest.fixture(scope="module")
+def done_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a run of four iterations, to be copied."""
+    log_dir = tmp_path_factory.mktemp("done")
+    Training(log_dir, *new(log_dir, 4)).finish()
+    return run_dir(log_dir)
+
+
 def same(a: object, b: object) -> bool:
     """Whether two nests of dictionaries, lists, tensors and numbers are equal, bit for bit."""
     if isinstance(a, torch.Tensor):
@@ -308,6 +316,37 @@ def test_a_damaged_newest_checkpoint_is_named_and_the_one_before_used(tmp_path: 
     assert f"note: checkpoint '{newest}' is damaged: a checksum is wrong; using model_2.pt instead" in output
     assert "resuming after iteration 2 of 6" in output
     assert load_checkpoint(run_dir(tmp_path)).iteration == 6
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("learning.csv", "samples,loss\n1,many\n", "learning.csv is damaged at line 2: could not convert"),
+        ("learning.csv", "samples\n" + 200_000 * "1" + "\n", "learning.csv is damaged at line 2: field larger than"),
+        ("learning.csv", None, "learning.csv: Is a directory"),
+        ("run.json", '{"starts": [', "run.json is damaged: Expecting value"),
+        ("run.json", '{"starts": 3}', "run.json is damaged: it holds no list 'starts'"),
+        ("run.json", "[]", "run.json is damaged: it holds no list 'starts'"),
+    ],
+    ids=["word", "long", "folder", "torn", "number", "list"],
+)
+def test_a_damaged_file_of_a_run_is_named_before_anything_changes(
+    done_run: Path, tmp_path: Path, name: str, content: str | None, said: str
+) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(done_run, folder)
+    (folder / name).unlink()
+    if content is None:
+        (folder / name).mkdir()
+    else:
+        (folder / name).write_text(content)
+    before = {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+    refused = Training(tmp_path, *resumed(folder / "model_2.pt", 5))
+    assert refused.wait() == 2
+    (error,) = (line for line in refused.output.splitlines() if line.startswith("error: "))
+    assert str(folder) in error and said in error
+    assert "Traceback" not in refused.output
+    assert {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()} == before
 
 
 class FullDisk:
