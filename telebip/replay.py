@@ -71,13 +71,18 @@ class Replay:
         )
 
 
+def fault_file(run_dir: Path, kind: str) -> Path:
+    """Return where a run's first fault of a kind is dumped."""
+    return run_dir / "faults" / f"{kind}.pt"
+
+
 def save_fault(run_dir: Path, kind: str, record: dict[str, Tensor], task: str, env: TelebipEnv) -> Path:
     """Write `run_dir/faults/<kind>.pt`, unless it is there, and return its path.
 
     Raises:
         OSError: it cannot be written.
     """
-    file = run_dir / "faults" / f"{kind}.pt"
+    file = fault_file(run_dir, kind)
     if file.exists():
         return file
     file.parent.mkdir(exist_ok=True)

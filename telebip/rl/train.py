@@ -22,7 +22,7 @@ from telebip.config.schema import PpoConfig
 from telebip.env import TelebipEnv
 from telebip.errors import UserError
 from telebip.mdp.curriculum import ramp
-from telebip.replay import describe, save_fault
+from telebip.replay import describe, fault_file, save_fault
 from telebip.rl.checkpoint import Checkpoint, prune_checkpoints, robot_properties, save_checkpoint
 from telebip.rl.distributed import Ranks
 from telebip.rl.log import EpisodeStatistics, RunLog
@@ -50,6 +50,8 @@ class Trainer:
         self.iteration = self.samples = 0
         self._saved = -1  # the iteration of the last checkpoint
         ppo = env.cfg.ppo
+        if env.num_envs * ppo.num_steps_per_env < 2:
+            raise UserError("an iteration of one sample has nothing to compare; raise num_envs or ppo.num_steps_per_env")
         if ppo.num_mini_batches > env.num_envs * ppo.num_steps_per_env:
             raise UserError(
                 f"ppo.num_mini_batches is {ppo.num_mini_batches}, but an iteration has only {env.num_envs} worlds x "
@@ -249,8 +251,11 @@ class Trainer:
             said = self.env.sim.advice.get(kind, "")
             if not self.ranks.is_main:
                 continue  # the first process alone writes
+            file = fault_file(self.run_dir, kind)
             try:
-                dumped = f"dumped to {save_fault(self.run_dir, kind, record, self.task, self.env)}, for play --replay"
+                dumped = f"not dumped, as {file} holds an earlier one"
+                if not file.exists():
+                    dumped = f"dumped to {save_fault(self.run_dir, kind, record, self.task, self.env)}, for play --replay"
             except OSError as error:
                 dumped = f"cannot be dumped: {error.strerror or error}"
             self.note(f"fault: {kind}, {describe(record)}{f' ({said})' if said else ''}; {dumped}")
@@ -276,9 +281,11 @@ class Trainer:
         parameters = [p for network in (self.learner.actor, self.learner.critic) for p in network.parameters()]
         finite = torch.stack([p.isfinite().all() for p in parameters]).all()
         if not finite or not all(math.isfinite(loss) for loss in losses.values()):
+            advice = "start again with a lower ppo.learning_rate"
+            if any(self.run_dir.glob("model_*.pt")):
+                advice = f"go on from the last checkpoint with a lower ppo.learning_rate: --resume {self.run_dir}"
             raise UserError(
-                f"the update of iteration {self.iteration + 1} made the networks non-finite (losses {losses}); go on from the "
-                f"last checkpoint with a lower ppo.learning_rate: --resume {self.run_dir}"
+                f"the update of iteration {self.iteration + 1} made the networks non-finite (losses {losses}); {advice}"
             )
 
     def _rsl_rl_cfg(self) -> dict:

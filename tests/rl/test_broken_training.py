@@ -13,6 +13,7 @@ from torch import Tensor
 from telebip.config import load_task
 from telebip.env import TelebipEnv
 from telebip.errors import UserError
+from telebip.replay import load_fault
 from telebip.rl.checkpoint import load_checkpoint
 from telebip.rl.train import Trainer
 from telebip.robot import Robot
@@ -68,6 +69,17 @@ def test_a_broken_world_is_noted_dumped_and_never_learned_from(robot: Robot, tmp
         assert all(math.isfinite(value) for name, value in scalars.items() if not name.startswith("train/episode"))
 
 
+def test_a_fault_that_is_not_dumped_as_there_is_one_says_so(robot: Robot, tmp_path: Path) -> None:
+    first = Training(robot, tmp_path, "ppo.max_iterations=1", "ppo.max_fault_rate=0.05")
+    first.learn(before_step=lambda step: first.break_world(2) if step == 3 else None)
+    second = Training(robot, tmp_path, "ppo.max_iterations=2", "ppo.max_fault_rate=0.05")
+    second.trainer.resume(load_checkpoint(tmp_path))
+    second.learn(before_step=lambda step: second.break_world(2) if step == 13 else None)
+    assert "step 4; dumped to " in first.notes[0]
+    assert f"step 14; not dumped, as {tmp_path}/faults/non_finite_state.pt holds an earlier one" in second.notes[0]
+    assert load_fault(tmp_path / "faults" / "non_finite_state.pt").record["step"] == 4
+
+
 def test_too_many_broken_worlds_stop_the_training_with_a_checkpoint(robot: Robot, tmp_path: Path) -> None:
     training = Training(robot, tmp_path, "ppo.max_iterations=5", "ppo.max_fault_rate=0.1")
     with pytest.raises(UserError, match=r"iteration 3: 0\.12 faulty worlds per .*\(10 non_finite_state, 10 engine_warning"):
@@ -103,6 +115,13 @@ def test_networks_that_an_update_ruins_are_not_saved(robot: Robot, tmp_path: Pat
     checkpoint = load_checkpoint(tmp_path)
     assert checkpoint.iteration == 2
     assert all(value.isfinite().all() for value in checkpoint.learner["critic_state_dict"].values())
+
+
+def test_networks_ruined_before_the_first_checkpoint_have_none_to_go_on_from(robot: Robot, tmp_path: Path) -> None:
+    training = Training(robot, tmp_path)
+    training.trainer.learner.update = lambda: {"value": math.nan}  # type: ignore[method-assign]
+    with pytest.raises(UserError, match=r"update of iteration 1 .*; start again with a lower ppo\.learning_rate$"):
+        training.learn()
 
 
 def test_another_robot_is_named(robot: Robot, tmp_path: Path) -> None:

@@ -124,6 +124,12 @@ def test_more_mini_batches_than_samples_are_refused(robot: Robot, tmp_path: Path
         trainer(robot, tmp_path, 1, "ppo.num_mini_batches=81")
 
 
+def test_a_single_sample_is_refused(robot: Robot, tmp_path: Path) -> None:
+    single = ("num_envs=1", "ppo.num_steps_per_env=1", "ppo.num_mini_batches=1")
+    with pytest.raises(UserError, match=r"one sample has nothing to compare; raise num_envs or ppo\.num_steps_per_env"):
+        trainer(robot, tmp_path, 1, *single)
+
+
 @pytest.mark.parametrize(
     ("overrides", "rate"), [([], None), (["ppo.learning_rate=1e-5"], 1e-5), (["ppo.schedule=fixed"], 2e-4)]
 )
