@@ -47,9 +47,17 @@ class Parser(argparse.ArgumentParser):
         raise UserError(f"{message} (see {self.prog} --help)")
 
 
-def invocation(command: str) -> str:
-    """Return what to type for a command: `telebip play` where that is how this one was started, else its script."""
-    return f"telebip {command}" if _is_telebip() else f"python scripts/{command}.py"
+def invocation(command: str, own: bool = False) -> str:
+    """Return what to type for a command: `telebip play` where that is how this one was started, else its script.
+
+    The program's `own` command may be reached by a script of the user's, as one with rewards of theirs; then it is that.
+    """
+    if _is_telebip():
+        return f"telebip {command}"
+    script = Path(sys.argv[0])
+    if own and script.suffix == ".py" and not Path(__file__).with_name(script.name).exists():
+        return f"python {script}"
+    return f"python scripts/{command}.py"
 
 
 def _is_telebip() -> bool:

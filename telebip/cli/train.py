@@ -44,9 +44,19 @@ def main(argv: Sequence[str] | None = None) -> None:
         if "optimizer_state_dict" not in checkpoint.learner:
             raise UserError(f"checkpoint '{checkpoint.path}' holds the policy alone; resume from a model_<iteration>.pt")
         task, config = checkpoint.task, load_task(checkpoint.config, overrides)
+        if config.seed != checkpoint.config.seed:
+            raise UserError(
+                f"--resume goes on with the checkpoint's generators, of seed {checkpoint.config.seed}; leave out the seed "
+                f"{config.seed}, or start a new run with it"
+            )
         run_dir: str | Path = checkpoint.path.resolve().parent
     elif options.task:
-        checkpoint, task, config, run_dir = None, Path(options.task).stem, load_task(options.task, overrides), options.log_dir
+        checkpoint, task, config, run_dir = (
+            None,
+            Path(options.task).stem,
+            load_task(options.task, overrides),
+            options.log_dir or "runs",
+        )
     else:
         raise UserError(f"which task? --task {{{','.join(task_names())}}}, or --resume a run")
     train(task, config, run_dir, checkpoint, options.device, options.backend, options.viewer == "rerun", options.connect)
@@ -102,14 +112,15 @@ def train(
         robot = load_robot(config.sim.robot)
         with console.status("creating the worlds (the warp backend compiles for a minute or two the first time)"):
             env = TelebipEnv(load_task(config, [f"seed={config.seed + ranks.rank}"]), robot, device, backend)
+            trainer = Trainer(env, task, Path(), ranks, note=lambda line: console.print(f"note: {line}"))
             run_dir = Path()
-            if ranks.is_main:
+            if ranks.is_main:  # after all that may be refused, so that this leaves no empty folder
                 run_dir = folder if isinstance(folder, Path) else create_run_dir(Path(folder), task)
                 stack.enter_context(exclusive(run_dir))
                 require_unchanged(run_dir, checkpoint)
                 rows_so_far(run_dir)  # whole, or refused before anything is changed; so is the next
                 read_starts(run_dir)
-            trainer = Trainer(env, task, run_dir, ranks, note=lambda line: console.print(f"note: {line}"))
+                trainer.run_dir = run_dir
         restart = trainer.resume(checkpoint) if checkpoint else ""
         total = config.ppo.max_iterations
         if trainer.iteration >= total:
@@ -143,9 +154,8 @@ def train(
         trainer.learn(stop, watch)
     finished = trainer.iteration >= total
     if not finished:
-        console.print(
-            f"stopped after iteration {trainer.iteration} of {total}; go on with: {invocation('train')} --resume {run_dir}"
-        )
+        again = f"{invocation('train', own=True)} --resume {run_dir}"
+        console.print(f"stopped after iteration {trainer.iteration} of {total}; go on with: {again}")
     console.print(f"see it walk: {invocation('play')} --checkpoint {run_dir}")
     return finished
 
@@ -163,7 +173,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         choices=("auto", "native", "warp"),
         help="physics engine: native is C MuJoCo on the CPU, warp is MuJoCo Warp (default: auto, warp on CUDA, else native)",
     )
-    parser.add_argument("--log-dir", metavar="DIR", default="runs", help="the run writes to DIR/<task>/<time> (default: runs)")
+    parser.add_argument("--log-dir", metavar="DIR", help="the run writes to DIR/<task>/<time> (default: runs)")
     parser.add_argument(
         "--resume",
         metavar="RUN_OR_CHECKPOINT",
@@ -172,7 +182,12 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--viewer", choices=("none", "rerun"), default="none", help="watch the training (default: none)")
     parser.add_argument("--connect", metavar="HOST:PORT", help="a running rerun viewer (default: start one here)")
     parser.add_argument("overrides", nargs="*", metavar="key.path=value", help="override any field of the task")
-    return parser.parse(argv)
+    options = parser.parse(argv)
+    if options.connect and options.viewer != "rerun":
+        raise UserError("--connect names a rerun viewer; it goes with --viewer rerun")
+    if options.resume and options.log_dir:
+        raise UserError("--resume goes on in the run's own folder; leave out --log-dir")
+    return options
 
 
 @contextmanager

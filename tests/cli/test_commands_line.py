@@ -68,6 +68,8 @@ LONG = 300 * "a"
         ([PLAY, "--replay", "f.pt", "--beside", "dcm"], ["--replay", "leave out --beside"]),
         ([PLAY, "--replay", "f.pt", "--num-envs", "8"], ["--replay", "leave out --num-envs"]),
         ([PLAY, "--replay", "f.pt", "gait.period=1"], ["--replay", "sim.robot=FILE", "'gait.period=1'"]),
+        ([TRAIN, "--task", "telebip_flat", "--connect", "localhost"], ["--connect", "--viewer rerun"]),
+        ([TRAIN, "--resume", "runs/mine", "--log-dir", "elsewhere"], ["--log-dir", "the run's own folder"]),
         ([PLAY, "--agent", "zero", "--viewer", "mujco"], ["--viewer", "mujco", "mujoco"]),
     ],
     ids=lambda value: " ".join(value[1:]) if value[0] in (TRAIN, PLAY, GALLERY) else "",
@@ -178,6 +180,20 @@ def test_a_run_goes_on_with_its_task_by_name_or_by_file_and_no_other(run_dir: Pa
         assert "has finished" in ran(TRAIN, "--resume", str(run_dir), "--max-iterations", "1", "--task", task)
     other = refusal(TRAIN, "--resume", str(run_dir), "--task", "telebip_flat")
     assert "is of task 'telebip_slow', not of 'telebip_flat'" in other
+
+
+@pytest.mark.parametrize("seed", [("--seed", "7"), ("seed=7",)])
+def test_a_run_goes_on_with_its_own_seed(run_dir: Path, seed: tuple[str, ...]) -> None:
+    before = (run_dir / "config.yaml").read_text()
+    assert "of seed 1; leave out the seed 7" in refusal(TRAIN, "--resume", str(run_dir), "--max-iterations", "9", *seed)
+    assert (run_dir / "config.yaml").read_text() == before
+    assert "has finished" in ran(TRAIN, "--resume", str(run_dir), "--max-iterations", "1", "--seed", "1")
+
+
+def test_what_is_refused_leaves_no_folder(tmp_path: Path) -> None:
+    arguments = ("--task", "telebip_flat", "--log-dir", str(tmp_path / "runs"), *TINY, "ppo.num_mini_batches=50")
+    assert "an iteration has only 8 worlds x 5 steps" in refusal(TRAIN, *arguments)
+    assert not (tmp_path / "runs").exists()
 
 
 def test_an_interrupted_run_ends_well_and_leaves_a_checkpoint(tmp_path: Path) -> None:

@@ -52,6 +52,24 @@ def test_help_says_how_it_was_started(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "  python scripts/play.py --agent zero\n" in text
 
 
+@pytest.mark.parametrize(
+    ("program", "own", "play"),
+    [
+        ("/usr/bin/telebip", "telebip train", "telebip play"),
+        ("scripts/train.py", "python scripts/train.py", "python scripts/play.py"),
+        ("scripts/reproduce.py", "python scripts/train.py", "python scripts/play.py"),
+        ("mine/train_level.py", "python mine/train_level.py", "python scripts/play.py"),
+        ("-c", "python scripts/train.py", "python scripts/play.py"),
+    ],
+)
+def test_a_run_goes_on_with_the_program_that_started_it(
+    monkeypatch: pytest.MonkeyPatch, program: str, own: str, play: str
+) -> None:
+    monkeypatch.setattr(sys, "argv", [program])
+    assert invocation("train", own=True) == own
+    assert invocation("play") == play
+
+
 def test_the_command_passes_arguments_on_and_sets_the_exit_status() -> None:
     code = "import sys; sys.argv = ['telebip', *sys.argv[1:]]; from telebip.cli.main import main; main()"
 
