@@ -1,5 +1,6 @@
-"""A console whose reader may leave."""
+"""The console that commands print to; imported late, as rich takes its time."""
 
+import io
 import os
 import sys
 
@@ -7,7 +8,16 @@ import rich.console
 
 
 class Console(rich.console.Console):
-    """Falls silent when its output cannot be written any more, so that the work goes on: `... | head`, a closed terminal."""
+    """Prints texts as they are, brackets in paths too, and signs that the encoding lacks as question marks.
+
+    Falls silent when its output cannot be written any more, so that the work goes on: `... | head`, a closed terminal.
+    """
+
+    def __init__(self, quiet: bool = False) -> None:
+        """Print to standard output, or nothing at all if `quiet`."""
+        if isinstance(sys.stdout, io.TextIOWrapper):
+            sys.stdout.reconfigure(errors="replace")
+        super().__init__(highlight=False, soft_wrap=True, markup=False, emoji=False, quiet=quiet)
 
     def on_broken_pipe(self) -> None:
         """Print nothing from here on; what Python writes itself when it ends goes nowhere too."""

@@ -1,10 +1,8 @@
 """`evaluate.py`: measure what walks, and report it."""
 
 import argparse
-import io
 import math
 import shlex
-import sys
 from collections.abc import Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -30,7 +28,9 @@ SET_HERE = {"num_envs": "--num-envs", "episode.length": "--duration"}
 def main(argv: Sequence[str] | None = None) -> None:
     """Parse arguments, measure, print, and write the report."""
     options = _parse(argv)
-    console = open_console()
+    from telebip.cli.console import Console
+
+    console = Console()
     with console.status("loading torch and the physics engine"):
         from telebip.eval.push import PushProtocol
         from telebip.eval.report import make_folder, write_report, write_results
@@ -62,17 +62,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     write_results(results, out)
     write_report([results], out, f"{subject.label}: how it walks", f"Measured by: {subject.source}", references=references())
     lines = (out / "report.md").read_text(encoding="utf-8").splitlines()
-    console.print("\n".join(line for line in lines if not line.startswith("![")), markup=False)
+    console.print("\n".join(line for line in lines if not line.startswith("![")))
     console.print(f"wrote {out}/results.json, report.md with its pictures, and report.html")
-
-
-def open_console():
-    """Return the console to print to; signs that its encoding lacks, such as ± in ASCII, become question marks."""
-    from rich.console import Console
-
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="replace")
-    return Console(highlight=False, soft_wrap=True)
 
 
 def default_folder(label: str) -> Path:

@@ -33,9 +33,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     if out.suffix != ".onnx":
         raise UserError(f"--out writes FILE.onnx, got '{out}'")
 
-    from rich.console import Console
+    from telebip.cli.console import Console
 
-    console = Console(highlight=False, soft_wrap=True)
+    console = Console()
     with console.status("loading torch"):
         from telebip.rl.export import export
     checkpoint = open_checkpoint(options.checkpoint)

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from telebip.cli.common import CONTROLLERS, Parser, open_checkpoint, resolve_device
-from telebip.cli.evaluate import open_console, speed
+from telebip.cli.evaluate import speed
 from telebip.config import TaskConfig, load_task
 from telebip.control.config import split_overrides
 from telebip.errors import UserError
@@ -49,7 +49,9 @@ def main(argv: Sequence[str] | None = None) -> None:
 def _play(options: argparse.Namespace, task: str, config: TaskConfig, command, checkpoint) -> None:
     from rich.progress import Progress
 
-    console = open_console()
+    from telebip.cli.console import Console
+
+    console = Console()
     with console.status("loading torch and the physics engine"):
         from telebip.env import TelebipEnv
         from telebip.eval.rollout import roll_out
@@ -88,9 +90,10 @@ def _play(options: argparse.Namespace, task: str, config: TaskConfig, command, c
 
 def _replay(options: argparse.Namespace) -> None:
     """Repeat the step of a dumped fault, say what happens at which physics step, and show it as asked."""
+    from telebip.cli.console import Console
     from telebip.replay import describe, load_fault, replay
 
-    console = open_console()
+    console = Console()
     fault = load_fault(options.replay)
     fault = replace(fault, config=load_task(fault.config, options.overrides))
     backend = fault.backend if options.backend == "auto" else options.backend

@@ -20,9 +20,9 @@ EXAMPLES = """\
 def main(argv: Sequence[str] | None = None) -> None:
     """Parse arguments, train, print how it went and write the files asked for."""
     options = _parse(argv)
-    from rich.console import Console
+    from telebip.cli.console import Console
 
-    console = Console(highlight=False, soft_wrap=True)
+    console = Console()
     with console.status("loading torch and the physics engine"):
         import torch
 

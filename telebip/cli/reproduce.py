@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from telebip.cli.common import Parser, open_checkpoint, resolve_device
-from telebip.cli.evaluate import controller_subject, open_console, progress_bar, references, subject_of
+from telebip.cli.evaluate import controller_subject, progress_bar, references, subject_of
 from telebip.config import load_task
 from telebip.errors import UserError, nearest
 
@@ -29,7 +29,9 @@ INTRODUCTION = (
 def main(argv: Sequence[str] | None = None) -> None:
     """Parse arguments, train, measure and report."""
     options = _parse(argv)
-    console = open_console()
+    from telebip.cli.console import Console
+
+    console = Console()
     with console.status("loading torch and the physics engine"):
         from telebip.eval.report import make_folder, write_report
         from telebip.eval.study import BASELINES, TRAININGS

@@ -91,7 +91,7 @@ def train(
     from telebip.rl.distributed import Ranks, joined
 
     ranks = Ranks.from_environment()
-    console = Console(highlight=False, soft_wrap=True, quiet=not ranks.is_main)
+    console = Console(quiet=not ranks.is_main)
     with console.status("loading torch and the physics engine"):
         from telebip.env import TelebipEnv
         from telebip.rl.checkpoint import require_unchanged, set_aside_newer

@@ -10,6 +10,7 @@ from processes import fresh
 from test_commands_line import ran, refusal
 
 from telebip.cli import evaluate, reproduce
+from telebip.cli.console import Console
 
 EVALUATE, REPRODUCE = "scripts/evaluate.py", "scripts/reproduce.py"
 SMALL = ("--num-envs", "2", "--duration", "2", "--device", "cpu")
@@ -87,9 +88,9 @@ def test_a_command_with_spaces_and_brackets_can_be_pasted() -> None:
 def test_signs_that_the_terminal_lacks_stop_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     stdout = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
     monkeypatch.setattr(sys, "stdout", stdout)
-    evaluate.open_console().print("0.676 ± 0.012 m/s")
+    Console().print("0.676 ± 0.012 m/s in [v2] of runs[/v2]")
     stdout.flush()
-    assert stdout.buffer.getvalue() == b"0.676 ? 0.012 m/s\n"
+    assert stdout.buffer.getvalue() == b"0.676 ? 0.012 m/s in [v2] of runs[/v2]\n"
 
 
 def test_the_study_at_toy_size_goes_on_where_it_stopped(tmp_path: Path) -> None:
