@@ -1,5 +1,6 @@
 """The console that commands print to; imported late, as rich takes its time."""
 
+import contextlib
 import io
 import os
 import sys
@@ -15,8 +16,9 @@ class Console(rich.console.Console):
 
     def __init__(self, quiet: bool = False) -> None:
         """Print to standard output, or nothing at all if `quiet`."""
-        if isinstance(sys.stdout, io.TextIOWrapper):
-            sys.stdout.reconfigure(errors="replace")
+        with contextlib.suppress(OSError):  # of a stream that cannot be changed any more
+            if isinstance(sys.stdout, io.TextIOWrapper):
+                sys.stdout.reconfigure(errors="replace")
         super().__init__(highlight=False, soft_wrap=True, markup=False, emoji=False, quiet=quiet)
 
     def on_broken_pipe(self) -> None:
