@@ -65,6 +65,7 @@ def _train(output: Path, arguments: list[str], before: Callable[[], None] | None
     os.dup2(descriptor, 1)
     os.dup2(descriptor, 2)
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # which tests under `nohup` would hand down ignored
     sys.argv = ["scripts/train.py", *arguments]
     torch.set_num_threads(1)
     if before:
