@@ -49,12 +49,17 @@ def test_the_robot_lies_beside_its_task_whatever_the_working_directory(tmp_path:
     assert load_task("telebip_flat").sim.robot == "assets/telebip.xml"  # telebip's own, from telebip's folder
 
 
+def example_at(file: Path) -> Path:
+    """Copy the example's MJCF to `file` in a new folder."""
+    file.parent.mkdir()
+    file.write_text((FOLDER / "rotary_knee.xml").read_text())
+    return file
+
+
 def test_a_robot_given_from_the_working_directory_is_found_from_any_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    robot = tmp_path / "robots" / "mine.xml"
-    robot.parent.mkdir()
-    robot.write_text((FOLDER / "rotary_knee.xml").read_text())
+    robot = example_at(tmp_path / "robots" / "mine.xml")
     (tmp_path / "tasks").mkdir()
     (tmp_path / "tasks" / "mine.yaml").write_text("base: telebip_flat\nsim: {robot: robots/mine.xml}\n")
     monkeypatch.chdir(tmp_path)
@@ -65,9 +70,7 @@ def test_a_robot_given_from_the_working_directory_is_found_from_any_other(
 def test_no_file_of_the_working_directory_stands_for_telebips_own_robot(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    other = tmp_path / "assets" / "telebip.xml"
-    other.parent.mkdir()
-    other.write_text((FOLDER / "rotary_knee.xml").read_text())
+    other = example_at(tmp_path / "assets" / "telebip.xml")
     monkeypatch.chdir(tmp_path)
     assert load_robot(load_task("telebip_flat").sim.robot).path == ROOT / "assets" / "telebip.xml"
     named = load_task("telebip_flat", ["sim.robot=assets/telebip.xml"]).sim.robot  # by the user, who means that one

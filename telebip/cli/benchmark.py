@@ -4,11 +4,14 @@ import argparse
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from telebip.cli.common import Parser, check_outputs, open_checkpoint, resolve_device
 from telebip.config import load_task, task_names
 from telebip.errors import UserError
+
+if TYPE_CHECKING:
+    from telebip.rl.checkpoint import Checkpoint
 
 EXAMPLES = """\
   benchmark.py
@@ -42,13 +45,13 @@ def main(argv: Sequence[str] | None = None) -> None:
 
         from telebip.cli.evaluate import progress_bar
         from telebip.rl.benchmark import machine_name, measure
-        from telebip.rl.checkpoint import POLICIES
         from telebip.rl.process import prepare_cpu
         from telebip.rl.run import describe_code
         from telebip.robot import load_robot
 
-    policy = options.checkpoint or _policy_for(options.task, options.overrides)
-    checkpoint = open_checkpoint(policy if options.checkpoint else POLICIES / policy)
+    given = options.checkpoint
+    checkpoint = open_checkpoint(given) if given else _shipped_for(options.task, options.overrides)
+    policy = given or checkpoint.path.parent.name
     task = options.task or checkpoint.task
     configs = [load_task(options.task or checkpoint.config, [*options.overrides, f"num_envs={n}"]) for n in options.num_envs]
     if configs[0].ppo.symmetry != checkpoint.config.ppo.symmetry:
@@ -94,15 +97,17 @@ def main(argv: Sequence[str] | None = None) -> None:
         console.print(f"wrote {options.plot}")
 
 
-def _policy_for(task: str | None, overrides: Sequence[str]) -> str:
+def _shipped_for(task: str | None, overrides: Sequence[str]) -> "Checkpoint":
     """Return the policy of `assets/policies` that walks in a task: its own, or one that learned as much of the gait."""
     from telebip.rl.checkpoint import POLICIES
 
     symmetry = load_task(task or "telebip_flat", overrides).ppo.symmetry
     for name in (Path(task or "").stem, "telebip_flat"):
-        if (POLICIES / name / "policy.pt").is_file() and open_checkpoint(POLICIES / name).config.ppo.symmetry == symmetry:
-            return name
-    return "telebip_efficient"
+        if (POLICIES / name / "policy.pt").is_file():
+            checkpoint = open_checkpoint(POLICIES / name)
+            if checkpoint.config.ppo.symmetry == symmetry:
+                return checkpoint
+    return open_checkpoint(POLICIES / "telebip_efficient")
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:

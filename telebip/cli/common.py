@@ -68,12 +68,7 @@ def run(command: Callable[[], None]) -> NoReturn:
     """Run a command: exit status 0, 2 after one line on standard error for a `UserError`, 130 when interrupted."""
     try:
         check_opengl()  # MuJoCo reads MUJOCO_GL when it is imported, and would fail with a traceback
-        try:
-            command()
-        except Exception as error:
-            if is_out_of_memory(error):
-                raise UserError("out of memory; take fewer worlds (--num-envs)") from error
-            raise
+        command()
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
@@ -81,8 +76,18 @@ def run(command: Callable[[], None]) -> NoReturn:
         print("interrupted", file=sys.stderr)
         sys.exit(130)
     except BrokenPipeError:  # the reader of our output has gone, as in `... | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        silence_stdout()
+    except Exception as error:
+        if not is_out_of_memory(error):
+            raise
+        print("error: out of memory; take fewer worlds (--num-envs)", file=sys.stderr)
+        sys.exit(2)
     sys.exit(0)
+
+
+def silence_stdout() -> None:
+    """Send nowhere what is yet to be printed, by Python itself when it ends too."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def open_checkpoint(path: str | Path) -> "Checkpoint":
@@ -93,6 +98,16 @@ def open_checkpoint(path: str | Path) -> "Checkpoint":
     for line in checkpoint.damaged:
         print(f"note: {line}; using {checkpoint.path.name} instead", file=sys.stderr)
     return checkpoint
+
+
+def check_connect(options: argparse.Namespace) -> None:
+    """Refuse a `--connect` that no `--viewer` heeds.
+
+    Raises:
+        UserError: it is one.
+    """
+    if options.connect and options.viewer != "rerun":
+        raise UserError("--connect names a rerun viewer; it goes with --viewer rerun")
 
 
 def check_outputs(json: str | None, plot: str | None) -> None:
@@ -115,6 +130,8 @@ def check_outputs(json: str | None, plot: str | None) -> None:
 
 def resolve_device(name: str) -> "torch.device":
     """Return the torch device that `auto`, `cpu`, `cuda` or `cuda:N` means on this machine; `auto` prefers CUDA.
+
+    A CUDA device becomes torch's current one.
 
     Raises:
         UserError: the name is none of these, or the device is not there.

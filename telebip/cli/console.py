@@ -2,10 +2,11 @@
 
 import contextlib
 import io
-import os
 import sys
 
 import rich.console
+
+from telebip.cli.common import silence_stdout
 
 
 class Console(rich.console.Console):
@@ -22,9 +23,9 @@ class Console(rich.console.Console):
         super().__init__(highlight=False, soft_wrap=True, markup=False, emoji=False, quiet=quiet)
 
     def on_broken_pipe(self) -> None:
-        """Print nothing from here on; what Python writes itself when it ends goes nowhere too."""
+        """Print nothing from here on."""
         self.quiet = True
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        silence_stdout()
 
     def _check_buffer(self) -> None:
         try:

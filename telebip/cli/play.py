@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from telebip.cli.common import CONTROLLERS, Parser, open_checkpoint, resolve_device
+from telebip.cli.common import CONTROLLERS, Parser, check_connect, open_checkpoint, resolve_device
 from telebip.cli.evaluate import speed
 from telebip.config import TaskConfig, load_task
 from telebip.control.config import split_overrides
@@ -277,6 +277,5 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     for name in ("record", "beside"):
         if options.viewer == "mujoco" and getattr(options, name):
             raise UserError(f"--viewer mujoco shows one walker, and records nothing; leave out --{name}")
-    if options.connect and options.viewer != "rerun":
-        raise UserError("--connect names a rerun viewer; it goes with --viewer rerun")
+    check_connect(options)
     return options

@@ -73,8 +73,10 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def _sentence(found: dict) -> str:
     """Return a verdict in words."""
-    own, stock = (f"{low:.2f}" if low == high else f"{low:.2f} to {high:.2f}" for low, high in found["episode_return"].values())
-    meet = f" ({'they overlap' if found['overlap'] else 'they do not overlap'})" if "to" in own + stock else ""
+    intervals = found["episode_return"].values()
+    own, stock = (f"{low:.2f}" if low == high else f"{low:.2f} to {high:.2f}" for low, high in intervals)
+    meet = "they overlap" if found["overlap"] else "they do not overlap"
+    meet = f" ({meet})" if any(low < high for low, high in intervals) else ""
     return f"return {own}, rsl-rl's {stock}{meet}; {found['train_over_stock']:.2f} times as fast"
 
 

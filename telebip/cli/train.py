@@ -7,7 +7,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from telebip.cli.common import Parser, invocation, open_checkpoint, resolve_device
+from telebip.cli.common import Parser, check_connect, invocation, open_checkpoint, resolve_device
 from telebip.config import TaskConfig, load_task, task_names
 from telebip.errors import UserError
 
@@ -51,12 +51,8 @@ def main(argv: Sequence[str] | None = None) -> None:
             )
         run_dir: str | Path = checkpoint.path.resolve().parent
     elif options.task:
-        checkpoint, task, config, run_dir = (
-            None,
-            Path(options.task).stem,
-            load_task(options.task, overrides),
-            options.log_dir or "runs",
-        )
+        checkpoint, task, config = None, Path(options.task).stem, load_task(options.task, overrides)
+        run_dir = options.log_dir or "runs"
     else:
         raise UserError(f"which task? --task {{{','.join(task_names())}}}, or --resume a run")
     train(task, config, run_dir, checkpoint, options.device, options.backend, options.viewer == "rerun", options.connect)
@@ -132,9 +128,8 @@ def train(
             for file in set_aside_newer(run_dir, trainer.iteration):
                 console.print(f"note: {file.name} is from after the checkpoint to go on from, and is in {file.parent} now")
             describe_run(run_dir, config, str(device), engine, ranks.size)
-        arithmetic = "bfloat16" if trainer.learner.use_mixed_precision else "float32"
         worlds = f"{config.num_envs} worlds" if ranks.size == 1 else f"{ranks.size} processes x {config.num_envs} worlds"
-        console.print(f"{task}: {worlds} on {device} ({engine}), update in {arithmetic}, writing to {run_dir}")
+        console.print(f"{task}: {worlds} on {device} ({engine}), update in {trainer.arithmetic}, writing to {run_dir}")
         if trainer.iteration:
             console.print(f"resuming after iteration {trainer.iteration} of {total}")
         if restart:
@@ -183,8 +178,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--connect", metavar="HOST:PORT", help="a running rerun viewer (default: start one here)")
     parser.add_argument("overrides", nargs="*", metavar="key.path=value", help="override any field of the task")
     options = parser.parse(argv)
-    if options.connect and options.viewer != "rerun":
-        raise UserError("--connect names a rerun viewer; it goes with --viewer rerun")
+    check_connect(options)
     if options.resume and options.log_dir:
         raise UserError("--resume goes on in the run's own folder; leave out --log-dir")
     return options

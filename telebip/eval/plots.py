@@ -113,7 +113,8 @@ def cost_of_transport(all_results: Sequence[Results], commands: Sequence[float] 
         axes.set_xticks(range(len(commands)), [f"{command:.1f} m/s" for command in commands])
         axes.grid(axis="x", visible=False)
         axes.set(ylabel="cost of transport [-]", title="Cost of transport (lower is better)")
-        axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+        if shown:
+            axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure
 
 

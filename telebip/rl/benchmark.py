@@ -104,9 +104,9 @@ class Ladder:
         return self.env.num_envs * self.env.cfg.ppo.num_steps_per_env
 
     @property
-    def uses_bfloat16(self) -> bool:
-        """Whether the update does, in telebip's own training."""
-        return self._trainer.learner.use_mixed_precision
+    def update(self) -> str:
+        """Arithmetic of the update in telebip's own training."""
+        return self._trainer.arithmetic
 
     def round(self) -> Seconds:
         """Measure every rung once, and walk on."""
@@ -233,7 +233,7 @@ def measure(
         "backend": ladder.env.sim.backend,
         "device": str(device),
         "num_envs": cfg.num_envs,
-        "update": "bfloat16" if ladder.uses_bfloat16 else "float32",
+        "update": ladder.update,
         **summary(seconds[1:], ladder.batch),
         "bytes_per_env": round(ladder.bytes_per_env),
         "env_steps_per_round": ladder.batch,

@@ -76,8 +76,7 @@ def race(
         at.append(racers["telebip"].samples)
         progress()
     own = racers["telebip"]
-    update = "bfloat16" if own.learner.use_mixed_precision else "float32"
-    return {"seed": cfg.seed, "backend": own.env.sim.backend, "update": update, "samples": at, **curves}
+    return {"seed": cfg.seed, "backend": own.env.sim.backend, "update": own.arithmetic, "samples": at, **curves}
 
 
 def verdict(races: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -68,6 +68,11 @@ class Trainer:
         ages = torch.randint(env.max_episode_length, (env.num_envs,), generator=env.generator, device=env.device)
         env.episode_length_buf.copy_(ages)
 
+    @property
+    def arithmetic(self) -> str:
+        """What the networks compute in: bfloat16 or float32."""
+        return "bfloat16" if self.learner.use_mixed_precision else "float32"
+
     def resume(self, checkpoint: Checkpoint) -> str:
         """Go on from a checkpoint of the same task and robot, bit for bit as if nothing had happened in between.
 

@@ -10,9 +10,10 @@ PACKAGES = {"egl": ("libEGL.so.1", "libegl1"), "osmesa": ("libOSMesa.so.8", "lib
 """Library of each way to render without a display, and the Debian package that holds it."""
 
 NAMES = ("egl", "osmesa", "glfw", "glx", "disable")
-"""What `MUJOCO_GL` may be; and as MuJoCo takes them:"""
+"""What to choose from in `MUJOCO_GL`."""
 
 MORE_NAMES = ("wgl", "cgl", "disabled", "off", "false", "0", "enable", "enabled", "on", "true", "1")
+"""What MuJoCo takes besides, somewhere."""
 
 
 def has_display() -> bool:
