@@ -5,8 +5,8 @@
     python examples/deploy_mujoco.py policy.onnx assets/telebip.xml --command 0.7 0 0
 
 `Policy` is what runs on a robot's computer: it takes sensor readings and returns joint targets, and all it knows comes from the
-ONNX file. `SimulatedRobot` is what a robot's drivers would replace: encoders, an inertial measurement unit, an estimate of the
-velocity, and position controllers with the gains of the file.
+ONNX file, what is observed and how many of the latest frames as well. `SimulatedRobot` is what a robot's drivers would replace:
+encoders, an inertial measurement unit, an estimate of the velocity, and position controllers with the gains of the file.
 """
 
 import argparse
@@ -31,22 +31,33 @@ class Readings:
     quat: np.ndarray  # orientation of the trunk, w x y z
 
 
+TERMS = (
+    *("joint_pos", "joint_vel", "last_action", "base_lin_vel", "base_ang_vel", "base_quat", "projected_gravity"),
+    *("command", "phase"),
+)
+"""What a policy may see, by telebip's names."""
+
+
 class Policy:
-    """An exported policy with the little state that its observation needs: time, last action, reference heading."""
+    """An exported policy with what its observation needs to remember: time, last action, reference heading, latest frames."""
 
     def __init__(self, file: Path) -> None:
-        """Load the network and its description."""
+        """Load the network and its description; exit if the policy sees something that is not in `TERMS`."""
         self._session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
         texts = self._session.get_modelmeta().custom_metadata_map
         self.about = {key: json.loads(text) for key, text in texts.items()}
         self._nominal, self._scale = np.array(self.about["nominal_pose"]), np.array(self.about["action_scale"])
-        self._parts = [(part["name"], part["size"], part["scale"]) for part in self.about["observation"]]
+        self._terms = [part["name"] for part in self.about["observation"]]
+        for name in self._terms:
+            if name not in TERMS:
+                raise SystemExit(f"{file}: the policy sees '{name}', which this example does not know; add it to Policy._seen")
 
     def start(self, readings: Readings) -> None:
         """Begin to walk: forget the past and take the present heading as reference."""
         self._steps = 0
         self._last_action = np.zeros(len(self._nominal))
         self._reference_heading = yaw(readings.quat)
+        self._frames: list[np.ndarray] = []  # the newest first
 
     def joint_targets(self, readings: Readings, command: np.ndarray) -> np.ndarray:
         """Return joint targets [rad | m] for the next `step_dt`; call once per `step_dt`.
@@ -55,26 +66,33 @@ class Policy:
             readings: the sensors, now.
             command: (vx forward, vy left, yaw rate) [m/s, m/s, rad/s].
         """
-        about = self.about
         if self._steps > 0:
-            self._reference_heading += about["step_dt"] * command[2]
+            self._reference_heading += self.about["step_dt"] * command[2]
+        seen, history = self._seen(readings, command), self.about["history"]
+        frame = np.concatenate([seen[name] for name in self._terms])
+        self._frames = [frame, *(self._frames or [frame] * history)][:history]
+        obs = np.concatenate(self._frames).astype(np.float32)
+        self._last_action = self._session.run(["actions"], {"obs": obs[None]})[0][0]
+        self._steps += 1
+        return self._nominal + self._scale * self._last_action
+
+    def _seen(self, readings: Readings, command: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the values of all `TERMS`."""
+        about = self.about
         error = (self._reference_heading - yaw(readings.quat) + np.pi) % (2.0 * np.pi) - np.pi
         correction = np.clip(about["heading_gain"] * error, -about["heading_limit"], about["heading_limit"])
         phase = np.sin(2.0 * np.pi * self._steps * about["step_dt"] / about["gait_period"])
-        seen = {
+        return {
             "joint_pos": readings.joint_pos - self._nominal,
             "joint_vel": readings.joint_vel,
             "last_action": self._last_action,
             "base_lin_vel": readings.lin_vel,
             "base_ang_vel": readings.ang_vel,
             "base_quat": relative_to_heading(readings.quat, self._reference_heading),
+            "projected_gravity": to_body(np.array([0.0, 0.0, -1.0]), readings.quat),
             "command": np.array([command[0], command[1], command[2] + correction]),
             "phase": np.array([phase, -phase]),
         }
-        obs = np.concatenate([scale * seen[name] for name, _, scale in self._parts]).astype(np.float32)
-        self._last_action = self._session.run(["actions"], {"obs": obs[None]})[0][0]
-        self._steps += 1
-        return self._nominal + self._scale * self._last_action
 
 
 class SimulatedRobot:
@@ -85,30 +103,25 @@ class SimulatedRobot:
         self.model = mujoco.MjModel.from_xml_path(str(file))
         self.data = mujoco.MjData(self.model)
         self.model.opt.timestep = about["physics_dt"]
-        self._joints = about["joint_names"]
-        self._motors = [self.model.actuator(name).id for name in self._joints]
+        joints = [self.model.joint(name) for name in about["joint_names"]]
+        self._qpos, self._qvel = [joint.qposadr[0] for joint in joints], [joint.dofadr[0] for joint in joints]
+        self._motors = [self.model.actuator_trnid[:, 0].tolist().index(joint.id) for joint in joints]
         self._substeps = round(about["step_dt"] / about["physics_dt"])
-        self._imu = self.model.site("imu").pos.copy()  # where the inertial measurement unit sits in the trunk's frame [m]
         for motor, kp, kd, limit in zip(self._motors, about["stiffness"], about["damping"], about["force_limit"], strict=True):
             self.model.actuator_gainprm[motor, 0] = kp
             self.model.actuator_biasprm[motor, 1:3] = -kp, -kd
             self.model.actuator_forcerange[motor] = -limit, limit
         mujoco.mj_resetDataKeyframe(self.model, self.data, self.model.key("home").id)
-        mujoco.mj_forward(self.model, self.data)
 
     def read(self) -> Readings:
-        """Read the named sensors."""
-
-        def sensor(name: str) -> np.ndarray:
-            return self.data.sensor(name).data.copy()
-
-        ang_vel = sensor("gyro")
+        """Read the true state; the trunk's free joint comes first."""
+        qpos, qvel = self.data.qpos, self.data.qvel
         return Readings(
-            joint_pos=np.concatenate([sensor(f"{joint}_pos") for joint in self._joints]),
-            joint_vel=np.concatenate([sensor(f"{joint}_vel") for joint in self._joints]),
-            lin_vel=sensor("velocimeter") - np.cross(ang_vel, self._imu),  # from the unit down to between the hips
-            ang_vel=ang_vel,
-            quat=sensor("orientation"),
+            joint_pos=qpos[self._qpos],
+            joint_vel=qvel[self._qvel],
+            lin_vel=to_body(qvel[:3], qpos[3:7]),
+            ang_vel=qvel[3:6].copy(),
+            quat=qpos[3:7].copy(),
         )
 
     def move(self, joint_targets: np.ndarray) -> None:
@@ -116,13 +129,12 @@ class SimulatedRobot:
         self.data.ctrl[self._motors] = joint_targets
         for _ in range(self._substeps):
             mujoco.mj_step(self.model, self.data)
-        mujoco.mj_forward(self.model, self.data)  # sensors of the state after the step, not of the one before it
 
 
 def walk(
     policy: Policy, robot: SimulatedRobot, command: np.ndarray, duration: float, show: Callable[[float], None] = lambda t: None
 ) -> np.ndarray:
-    """Walk for `duration` [s] and return the trajectory qpos, (steps, 13), one row after each policy step."""
+    """Walk for `duration` [s] and return the trajectory qpos, (steps, nq), one row after each policy step."""
     steps = round(duration / policy.about["step_dt"])
     trajectory = np.zeros((steps, robot.model.nq))
     policy.start(robot.read())
@@ -137,6 +149,13 @@ def yaw(quat: np.ndarray) -> float:
     """Return the heading [rad] of the x axis of the orientation w x y z."""
     w, x, y, z = quat
     return float(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
+
+
+def to_body(vector: np.ndarray, quat: np.ndarray) -> np.ndarray:
+    """Express a vector of the world's frame in that of the orientation w x y z."""
+    inverse, turned = quat * [1.0, -1.0, -1.0, -1.0], np.zeros(3)
+    mujoco.mju_rotVecQuat(turned, vector, inverse)
+    return turned
 
 
 def relative_to_heading(quat: np.ndarray, heading: float) -> np.ndarray:

@@ -50,7 +50,7 @@ class CudaGraph(Generic[Result]):
             except RuntimeError as error:
                 torch.cuda.set_stream(stream)  # where torch has not got to put it back
                 raise RuntimeError(
-                    "the step cannot be recorded as a CUDA graph. A reward of your own must not read values back to the host "
+                    "the step cannot be recorded as a CUDA graph. A term of your own must not read values back to the host "
                     "(.item(), `if` on a tensor), nor bring new ones from there (torch.tensor, a list as an index). Start "
                     "anew; sim.cuda_graph=false does without the graph"
                 ) from error

@@ -1,6 +1,6 @@
 """Faults on disk, and how to repeat them: the state of one world before the step that broke it, and all that acted on it."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,18 +10,19 @@ from torch import Tensor
 
 from telebip.archive import load_archive, save_archive
 from telebip.config import TaskConfig, parse_config, to_yaml
-from telebip.env import MODEL_FIELDS, TelebipEnv
+from telebip.env import TelebipEnv
 from telebip.errors import UserError
-from telebip.eval.rollout import Rollout
-from telebip.mdp.actions import action_scale, joint_targets
 from telebip.mdp.faults import KINDS
 from telebip.mdp.terminations import non_finite
 from telebip.robot import Robot, load_robot
-from telebip.sim import Backend, SimState, make_simulator
+from telebip.rollout import Rollout
+from telebip.sim import Backend, SimState, Simulator, make_simulator
 
-FORMAT = "telebip-fault-1"
-RECORD = {"step", "world", "action", "push_wrench_w", "time", "qpos", "qvel", "qacc_warmstart", *MODEL_FIELDS}
-"""What a fault's record holds at least: all that the outcome of a step depends on."""
+FORMAT = "telebip-fault-2"
+RECORD = {"step", "world", "action", "targets", "wrench_w", "time", "qpos", "qvel", "qacc_warmstart"}
+"""What a fault's record holds at least: all that the outcome of a step depends on, beside the fields of the model."""
+STATE = ("qpos", "qvel", "joint_pos", "foot_force", "joint_force", "joint_power", "joint_net_power")
+"""What of a state is kept for the rollout."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,8 @@ class Fault:
     kind: str  # of `telebip.mdp.faults.KINDS`
     config: TaskConfig
     backend: Backend
-    record: dict[str, Tensor]  # of one world: "step", "world", "action", "push_wrench_w", the engine's memory, model fields
+    model_fields: list[str]  # names of those that had a value per world
+    record: dict[str, Tensor]  # of one world: of `RECORD`, of the engine's memory and of the fields of the model
 
 
 @dataclass(frozen=True)
@@ -39,9 +41,9 @@ class Replay:
     """The policy step of a fault again, one physics step at a time."""
 
     robot: Robot
-    states: list[SimState]  # of one world: before the step, and after each of its physics steps
-    joint_target: Tensor  # (1, 6) [rad | m]
-    push_w: Tensor  # force on the trunk's centre of mass, world frame [N], (1, 3)
+    states: list[dict[str, Tensor]]  # `STATE` of one world: before the step, and after each of its physics steps
+    targets: Tensor  # of each physics step (decimation, num_joints) [rad | m]
+    force_w: Tensor  # on the trunk's centre of mass, world frame [N], (3,)
     faults: list[set[str]]  # kinds seen by then, as `states`
 
     def reproduces(self, kind: str) -> bool:
@@ -51,22 +53,23 @@ class Replay:
     def rollout(self) -> Rollout:
         """Return the physics steps as a rollout of one world, to be drawn and recorded; without commands and rewards."""
         steps = len(self.states)
-        state = {
-            field.name: torch.stack([getattr(state, field.name) for state in self.states]).numpy() for field in fields(SimState)
-        }
-        zeros = {
-            name: np.zeros((steps, 1, size), np.float32) for name, size in (("phase", 2), ("command", 3), ("reward_terms", 0))
-        }
+
+        def zeros(*size: int) -> np.ndarray:
+            return np.zeros((steps, 1, *size), np.float32)
+
         return Rollout(
             step_dt=self.robot.physics_dt,
             weight=self.robot.weight,
+            joint_names=self.robot.joint_names,
             reward_names=(),
-            **state,
-            **zeros,
-            joint_target=self.joint_target.expand(steps, 1, 6).numpy(),
-            push_w=self.push_w.expand(steps, 1, 3).numpy(),
-            reference_heading=np.zeros((steps, 1), np.float32),
-            reward=np.zeros((steps, 1), np.float32),
+            **{name: torch.stack([state[name] for state in self.states]).numpy() for name in STATE},
+            joint_target=torch.cat([self.targets[:1], self.targets])[:, None].numpy(),
+            push_w=self.force_w.expand(steps, 1, 3).numpy(),
+            phase=zeros(2),
+            command=zeros(3),
+            reference_heading=zeros(),
+            reward=zeros(),
+            reward_terms=zeros(0),
             fallen=np.zeros((steps, 1), bool),
         )
 
@@ -93,6 +96,7 @@ def save_fault(run_dir: Path, kind: str, record: dict[str, Tensor], task: str, e
         "config": to_yaml(env.cfg),
         "seed": env.cfg.seed,
         "backend": env.sim.backend,
+        "model_fields": list(env.sim.model_fields),
     }
     save_archive(file, {**about, "record": record})
     return file
@@ -107,12 +111,19 @@ def load_fault(path: str | Path) -> Fault:
     content = load_archive(Path(path), "fault", FORMAT)
     if content.get("kind") not in KINDS:
         raise UserError(f"fault '{path}': this version knows no '{content.get('kind')}'")
-    record = content.get("record")
-    if not (isinstance(record, dict) and record.keys() >= RECORD and all(isinstance(x, Tensor) for x in record.values())):
-        raise UserError(f"fault '{path}' is not complete: of the step's beginning it lacks something")
-    if content.get("backend") not in ("native", "warp") or not isinstance(content.get("config"), str):
+    record, fields = content.get("record"), content.get("model_fields")
+    if (
+        not isinstance(fields, list)
+        or content.get("backend") not in ("native", "warp")
+        or not isinstance(content.get("config"), str)
+    ):
         raise UserError(f"fault '{path}' is not complete: it lacks its engine or its configuration")
-    return Fault(content["kind"], parse_config(content["config"], f"{path}:config"), content["backend"], record)
+    if not (
+        isinstance(record, dict) and record.keys() >= {*RECORD, *fields} and all(isinstance(x, Tensor) for x in record.values())
+    ):
+        raise UserError(f"fault '{path}' is not complete: of the step's beginning it lacks something")
+    config = parse_config(content["config"], f"{path}:config", missing=[])  # physics needs no terms
+    return Fault(content["kind"], config, content["backend"], fields, record)
 
 
 def replay(fault: Fault, backend: Backend | None = None) -> Replay:
@@ -125,30 +136,38 @@ def replay(fault: Fault, backend: Backend | None = None) -> Replay:
     """
     cfg, record = fault.config, fault.record
     robot = load_robot(cfg.sim.robot)
-    capacity = cfg.sim.max_contacts, cfg.sim.max_constraints
-    sim = make_simulator(backend or fault.backend, robot, 1, 1, torch.device("cpu"), MODEL_FIELDS, capacity)
-    if any(record[name].shape != value.shape[1:] for name, value in {**sim.model_fields, **sim.memory}.items()):
-        raise UserError(f"the fault is of another robot than '{cfg.sim.robot}'")
-    for name, field in sim.model_fields.items():
-        field.copy_(record[name])
-    sim.load({name: record[name][None] for name in sim.memory})
-    action = record["action"][None]
-    seen = set() if action.isfinite().all() else {"non_finite_action"}
-    target = joint_targets(
-        torch.where(action.isfinite().all(), action, 0.0), torch.as_tensor(robot.nominal).float(), action_scale(cfg.action)
-    )
+    sim = _simulator_at(fault, robot, backend or fault.backend)
+    targets = record["targets"].expand(cfg.sim.decimation, -1)
+    seen = set() if record["action"].isfinite().all() else {"non_finite_action"}
     states, faults = [_copy(sim.state)], [set(seen)]
-    for _ in range(cfg.sim.decimation):
-        sim.step(target, record["push_wrench_w"][None])
+    for target in targets:
+        sim.step(target[None], record["wrench_w"][None])
         rows = torch.cat([torch.stack([non_finite(sim.state)]), sim.faults])[:, 0]
         seen |= {kind for kind, found in zip(KINDS[1:], rows.tolist(), strict=True) if found}
         states.append(_copy(sim.state))
         faults.append(set(seen))
-    return Replay(robot, states, target, record["push_wrench_w"][None, :3], faults)
+    return Replay(robot, states, targets, record["wrench_w"][:3], faults)
 
 
-def _copy(state: SimState) -> SimState:
-    return SimState(**{field.name: getattr(state, field.name).clone() for field in fields(SimState)})
+def _simulator_at(fault: Fault, robot: Robot, backend: Backend) -> Simulator:
+    """Return one world where the step began."""
+    sim_cfg, record = fault.config.sim, fault.record
+    capacity = sim_cfg.max_contacts, sim_cfg.max_constraints
+    sim = make_simulator(backend, robot, 1, 1, torch.device("cpu"), fault.model_fields, capacity=capacity)
+    expected = {**sim.model_fields, **sim.memory}
+    if record["targets"].shape[-1] != len(robot.joint_names) or any(
+        name not in record or record[name].shape != value.shape[1:] for name, value in expected.items()
+    ):
+        raise UserError(f"the fault is of another robot than '{sim_cfg.robot}'")
+    for name, field in sim.model_fields.items():
+        field.copy_(record[name])
+    sim.refresh_constants(torch.ones(1, dtype=torch.bool))
+    sim.load({name: record[name][None] for name in sim.memory})
+    return sim
+
+
+def _copy(state: SimState) -> dict[str, Tensor]:
+    return {name: getattr(state, name).clone() for name in STATE}
 
 
 def describe(record: dict[str, Any]) -> str:

@@ -1,6 +1,7 @@
 # pyright: reportAttributeAccessIssue=false
-"""The robot as its MJCF describes it: names, order, nominal pose and limits."""
+"""The robot as its MJCF describes it: its actuated joints, nominal pose, limits, feet and mirror image."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,47 +10,89 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telebip import ROOT
-from telebip.errors import UserError
+from telebip.errors import UserError, nearest
 from telebip.files import is_file
 
-JOINTS = ("right_hip_roll", "right_hip_pitch", "right_knee", "left_hip_roll", "left_hip_pitch", "left_knee")
-"""Joints and their actuators, in the order of actions and observations: right leg first, as the phase signals (p_r, p_l)."""
-
 FEET = ("right_foot", "left_foot")
+"""The order of all that is told of two feet: right first, as the phase signals (p_r, p_l)."""
 FOOT_SENSORS = tuple(f"{foot}_force" for foot in FEET)
 TRUNK, FLOOR, KEYFRAME = "trunk", "floor", "home"
+
+HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+MIRROR = np.array([1.0, -1.0, 1.0])
+"""Reflection of a polar vector at the plane y = 0; an axial one is reflected by its negative."""
+
+
+@dataclass(frozen=True)
+class JointMirror:
+    """How the actuated joints move in the mirror image: mirrored_joint[i] = sign[i] * joint[order[i]]."""
+
+    order: list[int]
+    sign: list[float]  # 1 or -1
 
 
 @dataclass(frozen=True)
 class Robot:
-    """A compiled model and what the MDP reads from it. Arrays follow the order of `JOINTS` and `FEET`; knees in m and N."""
+    """A compiled model and what the MDP reads from it. Joints in the order of `joint_names`, feet in that of `FEET`."""
 
     path: Path
     model: mujoco.MjModel  # everything that the file describes
-    engine_model: mujoco.MjModel  # what the engines step: the same motion, bit for bit, see `_engine_model`
-    home_qpos: NDArray[np.float64]  # (13,) standing on the ground, heading along x
-    nominal: NDArray[np.float64]  # (6,) joint positions of the home pose [rad | m]
-    joint_range: NDArray[np.float64]  # (6, 2) [rad | m]
-    force_limit: NDArray[np.float64]  # (6,) actuator force limits [N m | N]
+    joint_names: tuple[str, ...]  # the actuated joints, in the order of the actuators
+    home_qpos: NDArray[np.float64]  # (nq,) standing on the ground, heading along x
+    nominal: NDArray[np.float64]  # (num_joints,) joint positions of the home pose [rad | m]
+    joint_range: NDArray[np.float64]  # (num_joints, 2) [rad | m]
+    force_limit: NDArray[np.float64]  # (num_joints,) largest actuator forces [N m | N]
+    is_slide: NDArray[np.bool_]  # (num_joints,) whether a joint is prismatic: m and N instead of rad and N m
     weight: float  # m g [N]
-    trunk_id: int
+    trunk_id: int  # of `model`, as `floor_id`; an engine's model may number its parts otherwise
     floor_id: int
-    foot_sensor_adr: tuple[int, int]  # columns of `sensordata` that hold the feet's normal forces
-    engine_floor_id: int  # of `engine_model`, where geoms and sensors have other numbers
-    engine_foot_sensor_adr: tuple[int, int]
+    joint_columns: slice | list[int]  # of the joints in `qpos`; in `qvel` they stand one column further left
+    foot_lift: NDArray[np.float64]  # (2, num_joints) d(foot height) / d(joint position) in the home pose [m/rad | m/m]
+    mirror: JointMirror | str  # at the plane y = 0; or which part is not its own mirror image
 
     @property
     def physics_dt(self) -> float:
         """Physics step [s]."""
         return float(self.model.opt.timestep)
 
+    def engine_model(self, sensors: Sequence[str] = ()) -> mujoco.MjModel:
+        """Compile the file without what moves nothing and nobody reads, but costs the engine a seventh of every step.
+
+        These are sensors (an accelerometer alone takes a pass over the bodies), cameras, lights, geoms that collide with
+        nothing (inertias are computed before they go), and the search for constraint islands: one robot is one island. It
+        moves the same, bit for bit. Bodies, geoms and sensors may have other ids than in `model`: look them up by name.
+
+        Args:
+            sensors: names of the sensors to keep beside the feet's.
+
+        Raises:
+            UserError: there is no such sensor, or without the rest the file is no valid MJCF.
+        """
+        spec = mujoco.MjSpec.from_file(str(self.path))
+        kept = [sensor for sensor in spec.sensors if sensor.name in (*FOOT_SENSORS, *sensors)]
+        for name in sensors:
+            if name not in [sensor.name for sensor in kept]:
+                known = (sensor.name for sensor in spec.sensors if sensor.name)
+                raise UserError(f"{self.path}: no sensor named '{name}'; {nearest(name, known)}")
+        on_camera = any(mujoco.mjtObj.mjOBJ_CAMERA in (sensor.objtype, sensor.reftype) for sensor in kept)
+        dropped = [sensor for sensor in spec.sensors if sensor not in kept]
+        for part in (*dropped, *spec.lights, *([] if on_camera else spec.cameras)):
+            spec.delete(part)
+        # A rangefinder's rays end at geoms that collide with nothing, too.
+        spec.compiler.discardvisual = all(sensor.type != mujoco.mjtSensor.mjSENS_RANGEFINDER for sensor in kept)
+        spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
+        try:
+            return spec.compile()
+        except ValueError as error:
+            raise UserError(f"{self.path}: {error}") from error
+
 
 def load_robot(path: str | Path) -> Robot:
-    """Load a six-actuator biped; relative paths start at telebip's own folder, then at the working directory.
+    """Load a biped; relative paths start at telebip's own folder, then at the working directory.
 
-    The MJCF must name the body `trunk` with a free joint, the joints of `JOINTS` with a range and one position actuator of the
-    same name each, a touch sensor `<foot>_force` for each of `FEET`, the geom `floor`, and the keyframe `home`; see
-    docs/your_robot.md.
+    The MJCF must name the body `trunk` with a free joint, which comes first, a touch sensor `<foot>_force` for each of `FEET`,
+    the geom `floor`, and the keyframe `home`. All other joints are hinges and slides. Every actuator is a position actuator
+    with a force range, on a named joint with a range; a joint may have none. See docs/your_robot.md.
 
     Raises:
         UserError: the file is missing or is no valid MJCF, or something is missing or of another kind; the message says what.
@@ -58,81 +101,230 @@ def load_robot(path: str | Path) -> Robot:
     if file is None:
         raise UserError(f"robot file '{path}' does not exist")
     try:
-        model, engine_model = mujoco.MjModel.from_xml_path(str(file)), _engine_model(file)
+        model = mujoco.MjModel.from_xml_path(str(file))
     except ValueError as error:
-        raise UserError(f"{path}: {' '.join(str(error).split())}") from error
-    joints = [_id(model, "joint", name, path) for name in JOINTS]
-    actuators = [_id(model, "actuator", name, path) for name in JOINTS]
+        raise UserError(f"{path}: {error}") from error
     trunk = _id(model, "body", TRUNK, path)
     floor = _id(model, "geom", FLOOR, path)
     sensors = [_id(model, "sensor", name, path) for name in FOOT_SENSORS]
-    home = model.key(_id(model, "key", KEYFRAME, path))
-    _check(model, trunk, joints, actuators, sensors, path)
+    home = model.key(_id(model, "key", KEYFRAME, path)).qpos.copy()
+    _check_bodies(model, trunk, sensors, path)
+    _check_actuators(model, path)
+    joints = model.actuator_trnid[:, 0]
+    columns = model.jnt_qposadr[joints]
     return Robot(
-        path=file,
+        path=file.absolute(),
         model=model,
-        engine_model=engine_model,
-        home_qpos=home.qpos.copy(),
-        nominal=home.qpos[7:].copy(),
-        joint_range=model.jnt_range[joints].copy(),
-        force_limit=model.actuator_forcerange[:, 1].copy(),
+        joint_names=tuple(model.joint(joint).name for joint in joints),
+        home_qpos=home,
+        nominal=home[columns],
+        joint_range=model.jnt_range[joints],
+        force_limit=np.abs(model.actuator_forcerange).max(1),
+        is_slide=model.jnt_type[joints] == SLIDE,
         weight=float(model.body_subtreemass[trunk] * np.linalg.norm(model.opt.gravity)),
         trunk_id=trunk,
         floor_id=floor,
-        foot_sensor_adr=_sensor_adr(model),
-        engine_floor_id=_id(engine_model, "geom", FLOOR, path),
-        engine_foot_sensor_adr=_sensor_adr(engine_model),
+        joint_columns=_columns(columns.tolist()),
+        foot_lift=_foot_lift(model, home, model.sensor_objid[sensors], columns - 1),
+        mirror=_mirror(model, trunk, home, model.sensor_objid[sensors]),
     )
 
 
-def _engine_model(file: Path) -> mujoco.MjModel:
-    """Compile the file without what moves nothing and nobody reads, but costs the engine a seventh of every step.
-
-    These are sensors but the feet's (an accelerometer alone takes a pass over the bodies), cameras, lights, geoms that collide
-    with nothing (inertias are computed before they go), and the search for constraint islands: one robot is one island.
-    """
-    spec = mujoco.MjSpec.from_file(str(file))
-    sensors = [sensor for sensor in spec.sensors if sensor.name not in FOOT_SENSORS]
-    for part in (*sensors, *spec.cameras, *spec.lights):
-        spec.delete(part)
-    spec.compiler.discardvisual = True
-    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
-    return spec.compile()
+def _check_bodies(model: mujoco.MjModel, trunk: int, sensors: list[int], path: str | Path) -> None:
+    """Raise a `UserError` unless trunk, feet and joints are of the kinds that the MDP takes for granted."""
+    if model.njnt == 0 or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE or model.jnt_bodyid[0] != trunk:
+        raise UserError(f"{path}: the first joint must be a free joint, that of body '{TRUNK}'")
+    for joint in range(1, model.njnt):
+        if model.jnt_type[joint] not in (HINGE, SLIDE):
+            raise UserError(f"{path}: joint '{model.joint(joint).name}' must be a hinge or a slide")
+    for sensor in sensors:
+        if model.sensor_type[sensor] != mujoco.mjtSensor.mjSENS_TOUCH:
+            raise UserError(f"{path}: sensor '{model.sensor(sensor).name}' must be a touch sensor")
 
 
-def _sensor_adr(model: mujoco.MjModel) -> tuple[int, int]:
-    right, left = (int(model.sensor(name).adr[0]) for name in FOOT_SENSORS)
-    return right, left
-
-
-def _check(
-    model: mujoco.MjModel, trunk: int, joints: list[int], actuators: list[int], sensors: list[int], path: str | Path
-) -> None:
-    """Raise a `UserError` unless the named parts are of the kinds and in the order that the MDP takes for granted."""
-    order = ", ".join(JOINTS)
-    if (model.nq, model.nv) != (13, 12) or list(model.jnt_qposadr[joints]) != list(range(7, 13)):
-        raise UserError(f"{path}: expected a free joint followed by {order}, in this order, and no other joints")
-    if model.jnt_bodyid[0] != trunk:
-        raise UserError(f"{path}: the free joint must be that of body '{TRUNK}'")
-    if model.nu != 6 or actuators != list(range(6)) or list(model.actuator_trnid[:, 0]) != joints:
-        raise UserError(f"{path}: expected one actuator each for {order}, in this order, and no others")
-    position = (model.actuator_gainprm[:, 0] > 0) & (model.actuator_biasprm[:, 1] == -model.actuator_gainprm[:, 0])
-    for i, name in enumerate(JOINTS):
-        if not model.jnt_limited[joints[i]]:
-            raise UserError(f"{path}: joint '{name}' needs a range")
-        if not position[i]:
+def _check_actuators(model: mujoco.MjModel, path: str | Path) -> None:
+    """Raise a `UserError` unless every actuator's control is the target of one joint of its own."""
+    if model.nu == 0:
+        raise UserError(f"{path}: expected position actuators, one for each joint that a policy moves")
+    driven: set[str] = set()
+    for i in range(model.nactuator):
+        name = model.actuator(i).name or str(i)
+        on_joint = model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
+        if not on_joint or model.jnt_type[model.actuator_trnid[i, 0]] not in (HINGE, SLIDE):
+            raise UserError(f"{path}: actuator '{name}' must drive one joint, a hinge or a slide")
+        joint = model.joint(model.actuator_trnid[i, 0])
+        if not joint.name:
+            raise UserError(f"{path}: the joint of actuator '{name}' needs a name")
+        if joint.name in driven:
+            raise UserError(f"{path}: joint '{joint.name}' has a second actuator, '{name}'")
+        driven.add(joint.name)
+        if not model.jnt_limited[joint.id]:
+            raise UserError(f"{path}: joint '{joint.name}' needs a range")
+        if not _is_position(model, i):
             raise UserError(f"{path}: actuator '{name}' must be a position actuator: its control is a joint target")
+        if model.actuator_dyntype[i] != mujoco.mjtDyn.mjDYN_NONE:
+            raise UserError(f"{path}: actuator '{name}' must act at once: no time constant or other activation dynamics")
+        if model.actuator_gear[i, 0] != 1.0:
+            raise UserError(f"{path}: actuator '{name}' must have a gear of 1")
         if not model.actuator_forcelimited[i]:
             raise UserError(f"{path}: actuator '{name}' needs a forcerange")
-    for sensor, foot in zip(sensors, FEET, strict=True):
-        if model.sensor_type[sensor] != mujoco.mjtSensor.mjSENS_TOUCH:
-            raise UserError(f"{path}: sensor '{foot}_force' must be a touch sensor")
+
+
+def _is_position(model: mujoco.MjModel, i: int) -> bool:
+    """Whether an actuator's force is kp (control - position) and what depends on its velocity."""
+    kp = model.actuator_gainprm[i, 0]
+    is_linear = (
+        model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED and model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE
+    )
+    return is_linear and 0 < kp == -model.actuator_biasprm[i, 1]
 
 
 def _id(model: mujoco.MjModel, kind: str, name: str, path: str | Path) -> int:
-    """Return the id of the `kind` (joint, body, geom, actuator, sensor, key) of this name."""
+    """Return the id of the `kind` (body, geom, sensor, key) of this name."""
     try:
         return getattr(model, kind)(name).id
     except KeyError as error:  # MuJoCo lists the valid names
         valid = str(error.args[0]).partition("Valid names: ")[2]
         raise UserError(f"{path}: no {kind} named '{name}'; valid: {valid.strip('[]') or 'none'}") from error
+
+
+def _columns(columns: list[int]) -> slice | list[int]:
+    """Return a slice where columns lie side by side: what it selects is no copy."""
+    first, end = columns[0], columns[0] + len(columns)
+    return slice(first, end) if columns == list(range(first, end)) else columns
+
+
+def _foot_lift(
+    model: mujoco.MjModel, home: NDArray[np.float64], sites: NDArray[np.int32], dofs: NDArray[np.int32]
+) -> NDArray[np.float64]:
+    """Return the derivatives of the sites' heights with respect to the degrees of freedom `dofs`, (2, num_joints)."""
+    data, jacobian, rows = mujoco.MjData(model), np.zeros((3, model.nv)), []
+    data.qpos[:] = home
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    for site in sites:
+        mujoco.mj_jacSite(model, data, jacobian, None, site)
+        rows.append(jacobian[2, dofs])
+    return np.array(rows)
+
+
+def _mirror(model: mujoco.MjModel, trunk: int, home: NDArray[np.float64], sites: NDArray[np.int32]) -> JointMirror | str:
+    """Find how the joints mirror at the plane y = 0 through the trunk, or return which part is not its own mirror image.
+
+    A joint's image is the one whose name has the other side, or itself. In the home pose, heading along x, whatever belongs to
+    one must be the image of what belongs to the other, within a hundredth and a thousandth of its unit.
+    """
+    data = mujoco.MjData(model)
+    data.qpos[:] = home
+    data.qpos[:2] = 0.0
+    w, x, y, z = home[3:7]
+    half = 0.5 * np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    mujoco.mju_mulQuat(data.qpos[3:7], np.array([np.cos(half), 0.0, 0.0, -np.sin(half)]), home[3:7])
+    mujoco.mj_kinematics(model, data)
+
+    if not _same(data.qpos[3:7], data.qpos[3:7] * [1.0, -1.0, 1.0, -1.0]):
+        return f"body '{TRUNK}' leans to one side"
+    if not _same(data.site_xpos[sites[0]], data.site_xpos[sites[1]] * MIRROR):
+        return "places of the feet's touch sensors"
+    names, moments = [model.joint(joint).name for joint in range(model.njnt)], _moments(model, data, data.xpos[trunk])
+    actuator = {int(joint): i for i, joint in enumerate(model.actuator_trnid[:, 0])}
+    order, sign = [0] * len(actuator), [0.0] * len(actuator)
+    for i in range(1, model.njnt):
+        other = _other_side(names[i])
+        if other and other not in names:
+            return f"no joint '{other}'"
+        j = names.index(other) if other else i
+        pair = f"joints '{names[i]}' and '{other}'" if i != j else f"joint '{other}'"
+        if (i in actuator) != (j in actuator):
+            return f"only one actuator on {pair}"
+        signed = _axis_sign(model, data, i, j)
+        unlike = _unlike(model, data, moments, i, j, signed)
+        if unlike:
+            return f"{unlike} of {pair}"
+        if i in actuator:
+            a, b = actuator[i], actuator[j]
+            limits = model.actuator_forcerange
+            if not _same(limits[a], np.sort(signed * limits[b])):
+                return f"force limits of {pair}"
+            if not all(_same(prm[a], prm[b]) for prm in (model.actuator_gainprm, model.actuator_biasprm)):
+                return f"gains of {pair}"
+            order[a], sign[a] = b, signed
+    if not _mirrors(moments[trunk], moments[trunk]):
+        return f"masses of body '{TRUNK}'"
+    return JointMirror(order, sign)
+
+
+def _axis_sign(model: mujoco.MjModel, data: mujoco.MjData, i: int, j: int) -> float:
+    """Return s, 1 or -1, for which the axis of joint `i` is s times the image of that of joint `j`, or 0 if there is none.
+
+    The image of a slide's axis a is M a, with M = diag(1, -1, 1); a hinge's axis is an axial vector, and its image -M a.
+    """
+    is_hinge = model.jnt_type[i] == HINGE
+    image = data.xaxis[j] * (-MIRROR if is_hinge else MIRROR)
+    sign = 1.0 if image @ data.xaxis[i] > 0.0 else -1.0
+    return sign if model.jnt_type[i] == model.jnt_type[j] and _same(data.xaxis[i], sign * image) else 0.0
+
+
+def _unlike(model: mujoco.MjModel, data: mujoco.MjData, moments: NDArray[np.float64], i: int, j: int, sign: float) -> str:
+    """Return what of joint `i` is not the image of what joint `j` has, or nothing."""
+    if not sign:
+        return "axes"
+    if model.jnt_type[i] == HINGE and not _same(data.xanchor[i], data.xanchor[j] * MIRROR):
+        return "anchors"
+    if not _mirrors(moments[model.jnt_bodyid[i]], moments[model.jnt_bodyid[j]]):
+        return "masses"
+    columns = model.jnt_qposadr[[i, j], None]
+    for what, (own, others) in {
+        "home positions": data.qpos[columns],
+        "rest positions": model.qpos_spring[columns],
+        "ranges": model.jnt_range[[i, j]],
+    }.items():
+        if not _same(own, np.sort(sign * others)):
+            return what
+    dofs = columns - 1
+    for what, (own, others) in {
+        "stiffness": model.jnt_stiffness[[i, j]],
+        "damping": model.dof_damping[dofs],
+        "friction": model.dof_frictionloss[dofs],
+        "armature": model.dof_armature[dofs],
+    }.items():
+        if not _same(own, others):
+            return what
+    return ""
+
+
+def _moments(model: mujoco.MjModel, data: mujoco.MjData, origin: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the moments of mass of each body with all that hangs on it, in the world's axes, (nbody, 4, 4).
+
+        sum m [r r^T  r; r^T  1]                                                            [kg m^2, kg m, kg]
+
+    over all particles, r from `origin` to each.
+    """
+    moments = np.zeros((model.nbody, 4, 4))
+    for body in reversed(range(1, model.nbody)):
+        axes, place = data.ximat[body].reshape(3, 3), np.append(data.xipos[body] - origin, 1.0)
+        inertia = model.body_inertia[body]
+        moments[body, :3, :3] += axes * (0.5 * inertia.sum() - inertia) @ axes.T
+        moments[body] += model.body_mass[body] * np.outer(place, place)
+        moments[model.body_parentid[body]] += moments[body]
+    return moments
+
+
+def _mirrors(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
+    """Whether moments of mass are mirror images of each other."""
+    image = np.append(MIRROR, 1.0)
+    return _same(a, b * np.outer(image, image))
+
+
+def _same(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
+    return np.allclose(a, b, rtol=1e-2, atol=1e-3)
+
+
+def _other_side(name: str) -> str:
+    """Return the name of what takes the place of `name` in the mirror image: `right_knee` is `left_knee`, `waist` itself."""
+    for side, other in (("right", "left"), ("left", "right")):
+        if name.startswith(f"{side}_"):
+            return other + name.removeprefix(side)
+        if name.endswith(f"_{side}"):
+            return name.removesuffix(side) + other
+    return name

@@ -9,7 +9,10 @@ from telebip.viz.opengl import choose_opengl
 
 choose_opengl()  # before the imports below import MuJoCo
 
+from worlds import CALM
+
 from telebip.config import load_task
+from telebip.control.factory import with_estimate
 from telebip.env import TelebipEnv
 from telebip.robot import Robot, load_robot
 from telebip.sim import Backend
@@ -24,10 +27,15 @@ def robot() -> Robot:
 
 @pytest.fixture(scope="session")
 def make_env(robot: Robot) -> Callable[..., TelebipEnv]:
-    """Return a function that makes worlds of `telebip_flat` on the CPU; `calm` ones have no disturbances."""
+    """Return a function that makes worlds of `telebip_flat` on the CPU.
 
-    def make(*overrides: str, num_envs: int = 4, calm: bool = False, backend: Backend = "native") -> TelebipEnv:
-        switches = [f"disturbance.{name}.enabled=false" for name in ("push", "friction", "noise")] if calm else []
-        return TelebipEnv(load_task("telebip_flat", [f"num_envs={num_envs}", *switches, *overrides]), robot, "cpu", backend)
+    `calm` ones have no disturbances; those with an `estimate` have the group of observations that model-based walkers read.
+    """
+
+    def make(
+        *overrides: str, num_envs: int = 4, calm: bool = False, estimate: bool = False, backend: Backend = "native"
+    ) -> TelebipEnv:
+        config = load_task("telebip_flat", [f"num_envs={num_envs}", *(CALM if calm else ()), *overrides])
+        return TelebipEnv(with_estimate(config) if estimate else config, robot, "cpu", backend)
 
     return make

@@ -13,7 +13,7 @@ from telebip import ROOT
 FORKS = multiprocessing.get_context("forkserver")
 """Processes of their own, which need not import torch anew."""
 FORKS.set_forkserver_preload(
-    [f"telebip.{name}" for name in ("cli.main", "eval.report", "eval.suites", "rl.benchmark", "sim.native")] + ["rich.progress"]
+    [f"telebip.{name}" for name in ("cli.main", "eval.report", "eval.suites", "rl.train", "sim.native")] + ["rich.progress"]
 )
 
 Done = subprocess.CompletedProcess[str]

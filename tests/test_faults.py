@@ -15,10 +15,10 @@ from telebip.config import load_task
 from telebip.control.policy import Stateless
 from telebip.env import TelebipEnv
 from telebip.errors import UserError
-from telebip.eval.rollout import roll_out
 from telebip.mdp.faults import KINDS
 from telebip.replay import load_fault, replay, save_fault
 from telebip.robot import load_robot
+from telebip.rollout import roll_out
 from telebip.sim.native import NativeSimulator
 
 NUM_ENVS, BAD, STEPS = 8, 3, 20
@@ -65,7 +65,7 @@ def counts(extras: dict) -> dict[str, int]:
 
 @pytest.mark.parametrize("injection", INJECTIONS)
 def test_a_fault_is_counted_and_reset_and_stays_in_its_world(make_env: MakeEnv, injection: str) -> None:
-    healthy, faulty = (make_env("disturbance.push.interval=[0.1,0.3]", num_envs=NUM_ENVS) for _ in range(2))
+    healthy, faulty = (make_env("events.push.interval=[0.1,0.3]", num_envs=NUM_ENVS) for _ in range(2))
     inject, kinds = INJECTIONS[injection]
     for step, action in enumerate(random_actions(STEPS, NUM_ENVS, 0.5)):
         given = inject(faulty, action) if step == 6 else action
@@ -153,9 +153,13 @@ def test_a_dumped_fault_happens_again(make_env: MakeEnv, tmp_path: Path, injecti
         assert len(again.states) == 1 + env.cfg.sim.decimation
 
 
-def test_a_healthy_step_replays_bit_for_bit(make_env: MakeEnv, tmp_path: Path) -> None:
+RANDOM_MODEL = "events.trunk_mass={term: mass, bodies: [trunk], scale: [0.8, 1.2]}"
+
+
+@pytest.mark.parametrize("overrides", [(), ("actions.physics_delay=[1,3]", RANDOM_MODEL)], ids=["plain", "late"])
+def test_a_healthy_step_replays_bit_for_bit(make_env: MakeEnv, tmp_path: Path, overrides: tuple[str, ...]) -> None:
     """What a dump holds is all that the step depended on: after a broken action, the nominal pose is held."""
-    env = make_env(NEVER_FALL, num_envs=NUM_ENVS)
+    env = make_env(NEVER_FALL, *overrides, num_envs=NUM_ENVS)
     for action in random_actions(10, NUM_ENVS, 0.5):
         env.step(action)
     seen = {}
@@ -166,8 +170,9 @@ def test_a_healthy_step_replays_bit_for_bit(make_env: MakeEnv, tmp_path: Path) -
     env._reset = step_without_reset  # type: ignore[method-assign]
     env.step(break_action(env, torch.zeros(NUM_ENVS, 6)))
     again = replay(load_fault(save_fault(tmp_path, "non_finite_action", env.take_faults()["non_finite_action"], "t", env)))
-    assert torch.equal(again.states[-1].qpos[0], seen["qpos"])
-    assert not torch.equal(again.states[0].qpos[0], seen["qpos"])
+    assert torch.equal(again.states[-1]["qpos"][0], seen["qpos"])
+    assert not torch.equal(again.states[0]["qpos"][0], seen["qpos"])
+    assert again.rollout().joint_target.shape == (1 + env.cfg.sim.decimation, 1, 6)
 
 
 def test_only_the_first_fault_of_a_kind_is_kept(make_env: MakeEnv, tmp_path: Path) -> None:
@@ -200,13 +205,13 @@ def test_noting_faults_waits_for_nothing(make_env: MakeEnv) -> None:
 
 @pytest.mark.parametrize(
     ("content", "says"),
-    [(b"", "not a telebip fault"), (b"not this", "not a telebip fault"), (None, "has format 'telebip-checkpoint-1'")],
+    [(b"", "not a telebip fault"), (b"not this", "not a telebip fault"), (None, "has format 'telebip-checkpoint-2'")],
     ids=["empty", "bytes", "checkpoint"],
 )
 def test_what_is_no_fault_is_refused(tmp_path: Path, content: bytes | None, says: str) -> None:
     path = tmp_path / "fault.pt"
     if content is None:
-        save_archive(path, {"format": "telebip-checkpoint-1"})
+        save_archive(path, {"format": "telebip-checkpoint-2"})
     else:
         path.write_bytes(content)
     with pytest.raises(UserError, match=says):
@@ -226,7 +231,7 @@ def test_a_damaged_fault_is_refused(make_env: MakeEnv, tmp_path: Path) -> None:
         load_fault(path)
 
 
-@pytest.mark.parametrize("missing", ["record", "backend", "config", "action", "qpos"])
+@pytest.mark.parametrize("missing", ["record", "backend", "config", "model_fields", "action", "targets", "qpos", "geom_friction"])
 def test_an_incomplete_fault_is_refused(make_env: MakeEnv, tmp_path: Path, missing: str) -> None:
     env = make_env()
     env.step(torch.full((4, 6), torch.nan))

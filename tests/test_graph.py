@@ -7,21 +7,20 @@ from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torch import Tensor
+from torch.utils import _pytree as pytree
 from torch.utils._python_dispatch import TorchDispatchMode
+from worlds import EVENTFUL, MORE_EVENTFUL, put_low, random_actions
 
 from telebip import ROOT
 from telebip.config import load_task
 from telebip.env import TelebipEnv
 from telebip.graph import CudaGraph, _no_garbage_collection
-from telebip.robot import Robot
+from telebip.robot import Robot, load_robot
 from telebip.sim import indexed
-from tests.worlds import put_low, random_actions
 
-EVENTFUL = (
-    *("episode.length=0.3", "command.resampling_time=0.1", "disturbance.push.interval=[0.06,0.2]"),
-    *("disturbance.push.force=150.0", "reward.energy.k_energy=-0.3", "ppo.max_fault_rate=1.0"),
-)
+TASKS = pytest.mark.parametrize("task", [EVENTFUL, MORE_EVENTFUL], ids=["eventful", "more eventful"])
 
 
 class Recording(TorchDispatchMode):
@@ -73,9 +72,15 @@ def replayed(env: TelebipEnv) -> TelebipEnv:
     return env
 
 
-@pytest.mark.parametrize("keep_final_obs", [False, True])
-def test_a_recorded_step_makes_every_later_step(robot: Robot, keep_final_obs: bool) -> None:
-    config = load_task("telebip_flat", ["num_envs=6", *EVENTFUL])
+def same(obs: TensorDict, obs_2: TensorDict) -> None:
+    assert set(obs.keys()) == set(obs_2.keys())
+    for group in obs.keys():  # noqa: SIM118 (a TensorDict iterates over its rows)
+        assert torch.equal(obs[group], obs_2[group])
+
+
+@pytest.mark.parametrize(("task", "keep_final_obs"), [(EVENTFUL, False), (EVENTFUL, True), (MORE_EVENTFUL, True)])
+def test_a_recorded_step_makes_every_later_step(robot: Robot, task: tuple[str, ...], keep_final_obs: bool) -> None:
+    config = load_task("telebip_flat", ["num_envs=6", *task])
     plain, env = (TelebipEnv(config, robot, "cpu", "warp", keep_final_obs) for _ in range(2))
     env = replayed(env)
     seen = {"fallen": 0, "timed out": 0, "faults": 0}
@@ -88,26 +93,32 @@ def test_a_recorded_step_makes_every_later_step(robot: Robot, keep_final_obs: bo
         if number == 40:
             for each in (plain, env):
                 each.set_command(0.6, 0.0, 0.1)
-                each.set_progress(3e6)
+                each.set_samples(3e6)
+                each.push(torch.tensor([20.0, 0.0, -5.0]))
         (obs, rewards, dones, extras), (obs_2, rewards_2, dones_2, extras_2) = plain.step(action), env.step(action)
-        assert torch.equal(obs["policy"], obs_2["policy"])
+        same(obs, obs_2)
         assert torch.equal(rewards, rewards_2)
         assert torch.equal(dones, dones_2)
         assert torch.equal(extras["time_outs"], extras_2["time_outs"])
         assert extras["log"] == extras_2["log"]
         if keep_final_obs:
-            assert torch.equal(extras["final_obs"]["policy"], extras_2["final_obs"]["policy"])
+            same(extras["final_obs"], extras_2["final_obs"])
         seen["fallen"] += int((dones & ~extras["time_outs"]).sum())
         seen["timed out"] += int(extras["time_outs"].sum())
         seen["faults"] += int(extras["log"]["fault/worlds"])
     assert min(seen.values()) > 0
+    for (name, value), (_, value_2) in zip(plain.state.items(), env.state.items(), strict=True):
+        assert torch.equal(value, value_2), name
+    for name, field in plain.sim.model_fields.items():
+        assert torch.equal(field, env.sim.model_fields[name]), name
     fault, fault_2 = plain.take_faults()["non_finite_action"], env.take_faults()["non_finite_action"]
     assert int(fault["step"]) == int(fault_2["step"]) == 21
     assert int(fault["world"]) == int(fault_2["world"]) == 2
 
 
-def test_a_recorded_step_goes_on_from_a_state(robot: Robot) -> None:
-    config = load_task("telebip_flat", ["num_envs=3", *EVENTFUL])
+@TASKS
+def test_a_recorded_step_goes_on_from_a_state(robot: Robot, task: tuple[str, ...]) -> None:
+    config = load_task("telebip_flat", ["num_envs=3", *task])
     first, second = (replayed(TelebipEnv(config, robot, "cpu", "warp")) for _ in range(2))
     actions = random_actions(12, 3)
     for action in actions[:8]:
@@ -116,7 +127,7 @@ def test_a_recorded_step_goes_on_from_a_state(robot: Robot) -> None:
     second.step(actions[0])
     second.load_state_dict(first.state_dict())
     for action in actions[8:]:
-        assert torch.equal(first.step(action)[0]["policy"], second.step(action)[0]["policy"])
+        same(first.step(action)[0], second.step(action)[0])
 
 
 def test_what_a_recorded_step_returned_is_not_written_to_again(robot: Robot) -> None:
@@ -130,21 +141,71 @@ def test_what_a_recorded_step_returned_is_not_written_to_again(robot: Robot) -> 
     assert extras["log"] == kept[2]
 
 
+def brought_in(recording: Recording) -> list[tuple[str, int]]:
+    """Each operator's tensors that no operator before has made, by the operator's name and where they lie in memory."""
+    made: set[int] = set()
+    brought = []
+    for func, args, kwargs, result in recording.calls:
+        for tensor in _tensors(pytree.tree_leaves((args, kwargs))):
+            place = tensor.untyped_storage().data_ptr()
+            if place not in made:
+                brought.append((str(func), place))
+        made.update(tensor.untyped_storage().data_ptr() for tensor in _tensors(result))
+    return brought
+
+
+NAMED = (
+    "events.load={term: mass, scale: [0.9, 1.1], bodies: [left_foot, trunk]}",
+    "events.joints={term: model_field, field: dof_damping, range: [0.9, 1.1], names: [left_knee, right_knee]}",
+    "events.shift={term: model_field, field: body_ipos, range: [-0.01, 0.01], operation: add, names: [trunk], column: 0}",
+)
+
+
+@pytest.mark.parametrize(
+    ("task", "overrides"),
+    [
+        ("telebip_flat", EVENTFUL),
+        ("telebip_flat", (*MORE_EVENTFUL, *NAMED)),
+        ("tests/robots/four_joints.yaml", ()),
+    ],
+    ids=["eventful", "more eventful", "joints that do not lie side by side"],
+)
+def test_a_step_brings_nothing_new_from_the_host(task: str, overrides: tuple[str, ...]) -> None:
+    """As a list as an index or torch.tensor would, which no recording on CUDA can: all that is there was there before."""
+    config = load_task(task, ["num_envs=2", *overrides])
+    env = TelebipEnv(config, load_robot(config.sim.robot), "cpu", "warp")
+    env.step(torch.zeros(2, env.num_actions))
+    for function in (env._prepare_step, env._finish_step):
+        with Recording() as first:
+            function()
+        with Recording() as second:
+            function()
+        assert brought_in(first) == brought_in(second)
+
+    with Recording() as first:
+        torch.zeros(3)[[0, 2]]
+    with Recording() as second:
+        torch.zeros(3)[[0, 2]]
+    assert brought_in(first) != brought_in(second)  # this is how it would be seen
+
+
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-def test_on_cuda_the_graphs_do_what_the_functions_do(robot: Robot) -> None:
+@TASKS
+def test_on_cuda_the_graphs_do_what_the_functions_do(robot: Robot, task: tuple[str, ...]) -> None:
     """Sums in another order round differently, and contacts let that grow; within 15 steps it stays below 1e-3."""
     plain, env = (
-        TelebipEnv(load_task("telebip_flat", ["num_envs=64", *EVENTFUL, f"sim.cuda_graph={graph}"]), robot, "cuda", "warp")
+        TelebipEnv(load_task("telebip_flat", ["num_envs=64", *task, f"sim.cuda_graph={graph}"]), robot, "cuda", "warp")
         for graph in ("false", "true")
     )
     for action in random_actions(15, 64, 0.3).cuda():
         (obs, rewards, dones, extras), (obs_2, rewards_2, dones_2, extras_2) = plain.step(action), env.step(action)
-        torch.testing.assert_close(obs["policy"], obs_2["policy"], atol=1e-3, rtol=0.0)
+        for group in plain.groups:
+            torch.testing.assert_close(obs[group], obs_2[group], atol=1e-3, rtol=0.0)
         torch.testing.assert_close(rewards, rewards_2, atol=1e-3, rtol=0.0)
         assert torch.equal(dones, dones_2)
         assert extras["log"].keys() == extras_2["log"].keys()
-    assert int(env.num_steps) == 15
+    assert int(env.state.num_steps) == 15
     assert torch.equal(plain.generator.get_state(), env.generator.get_state())
 
 
@@ -164,7 +225,7 @@ from telebip.env import TelebipEnv
 from telebip.robot import load_robot
 
 env = TelebipEnv(load_task("telebip_flat", ["num_envs=4"]), load_robot("assets/telebip.xml"), "cuda", "warp")
-env._rewards["cmd"] = lambda context: context.action.sum(1) * context.action.sum().item()
+env._rewards["cmd"] = lambda step: step.action.sum(1) * step.action.sum().item()
 for _ in range(2):
     env.step(torch.zeros(4, 6, device="cuda"))
 """

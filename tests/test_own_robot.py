@@ -8,13 +8,14 @@ import numpy as np
 import onnxruntime
 import pytest
 import torch
+from worlds import CALM
 
 from telebip import ROOT
 from telebip.cli import evaluate, export, play, train
 from telebip.config import load_task
 from telebip.env import TelebipEnv
 from telebip.rl.checkpoint import load_checkpoint
-from telebip.robot import load_robot
+from telebip.robot import FLOOR, FOOT_SENSORS, KEYFRAME, TRUNK, load_robot
 
 FOLDER = ROOT / "tests" / "robots"
 TASK = FOLDER / "rotary_knee.yaml"
@@ -34,7 +35,7 @@ def test_its_knees_are_hinges_and_it_stands_on_its_feet() -> None:
     robot = load_robot(FOLDER / "rotary_knee.xml")
     np.testing.assert_allclose(robot.nominal, [0.0, -0.35, 0.7] * 2)
     np.testing.assert_allclose(robot.force_limit, [50.0, 50.0, 80.0] * 2)
-    config = load_task(str(TASK), ["num_envs=4", "episode.min_hip_height=0.6"])
+    config = load_task(str(TASK), ["num_envs=4", "terminations.fallen.min_hip_height=0.6"])
     env = TelebipEnv(config, robot, "cpu", "native")
     for _ in range(10):  # 0.2 s in the nominal pose, from random initial states
         _, _, dones, _ = env.step(torch.zeros(4, 6))
@@ -87,7 +88,7 @@ def test_a_base_lies_beside_the_task_that_names_it(tmp_path: Path, monkeypatch: 
 
 
 def test_it_is_played_and_measured_from_its_checkpoint_alone(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert load_checkpoint(run_dir).config.action.knee == 0.5
+    assert load_checkpoint(run_dir).config.actions.scale["knee"] == 0.5
     play.main(["--checkpoint", str(run_dir), "--num-envs", "2", "--duration", "1", "--device", "cpu"])
     text = capsys.readouterr().out
     assert "rotary_knee, 2 worlds x 1 s" in text
@@ -128,9 +129,7 @@ def test_its_export_says_newton_metres(run_dir: Path) -> None:
 def test_both_engines_take_it() -> None:
     states = []
     for backend in ("native", "warp"):
-        config = load_task(
-            str(TASK), ["num_envs=2", *(f"disturbance.{n}.enabled=false" for n in ("push", "friction", "noise"))]
-        )
+        config = load_task(str(TASK), ["num_envs=2", *CALM])
         env = TelebipEnv(config, load_robot(config.sim.robot), "cpu", backend)
         for _ in range(5):
             env.step(torch.full((2, 6), 0.1))
@@ -140,7 +139,7 @@ def test_both_engines_take_it() -> None:
 
 def test_the_tutorial_names_what_the_loader_demands() -> None:
     text = (ROOT / "docs" / "your_robot.md").read_text(encoding="utf-8")
-    for name in ("trunk", "floor", "home", "right_foot_force", "left_foot_force", "right_hip_roll", "left_knee"):
+    for name in (TRUNK, FLOOR, KEYFRAME, *FOOT_SENSORS):
         assert f"`{name}`" in text
     task = (FOLDER / "rotary_knee.yaml").read_text(encoding="utf-8")
     shown = re.search(r"```yaml\n(.*?)```", text, re.DOTALL)

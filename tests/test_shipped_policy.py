@@ -3,16 +3,17 @@
 import numpy as np
 import pytest
 import torch
+from worlds import CALM
 
 from telebip import ROOT
 from telebip.config import load_task
 from telebip.env import TelebipEnv
-from telebip.eval.rollout import Rollout, roll_out
 from telebip.eval.walk import summarise
 from telebip.rl.checkpoint import load_checkpoint
 from telebip.rl.curve import read_curve
 from telebip.rl.policy import load_policy
 from telebip.robot import Robot
+from telebip.rollout import Rollout, roll_out
 from telebip.sim import Backend
 
 SPEEDS = (0.5, 0.7, 1.0)  # m/s
@@ -33,8 +34,7 @@ def walk(
 ) -> Rollout:
     """Walk `worlds` of a shipped policy at each speed, without disturbances and from random initial velocities."""
     checkpoint = load_checkpoint(ROOT / "assets" / "policies" / policy)
-    calm = [f"disturbance.{name}.enabled=false" for name in ("push", "friction", "noise")]
-    config = load_task(checkpoint.config, [f"num_envs={len(speeds) * worlds}", f"episode.length={seconds + 1}", *calm])
+    config = load_task(checkpoint.config, [f"num_envs={len(speeds) * worlds}", f"episode.length={seconds + 1}", *CALM])
     env = TelebipEnv(config, robot, "cpu", backend)
     env.set_commands(torch.tensor([[speed, 0.0, 0.0] for speed in speeds]).repeat_interleave(worlds, dim=0))
     return roll_out(env, load_policy(checkpoint, "cpu"), round(seconds / env.step_dt))

@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 from yourdfpy import URDF
 
 from telebip import ROOT
-from telebip.robot import JOINTS, Robot
+from telebip.robot import Robot
 
+JOINTS = ("right_hip_roll", "right_hip_pitch", "right_knee", "left_hip_roll", "left_hip_pitch", "left_knee")
 LINKS = [
     "trunk", "right_hip", "right_thigh", "right_shank", "right_foot", "left_hip", "left_thigh", "left_shank", "left_foot"
 ]  # fmt: skip
@@ -55,8 +56,8 @@ def test_joint_type_axis_and_limits(urdf: URDF, robot: Robot, name: str) -> None
     assert (joint.child, joint.parent) == (child.name, model.body(child.parentid[0]).name)
 
 
-def test_actuated_joints_are_in_the_order_of_the_actions(urdf: URDF) -> None:
-    assert tuple(urdf.actuated_joint_names) == JOINTS
+def test_actuated_joints_are_in_the_order_of_the_actions(urdf: URDF, robot: Robot) -> None:
+    assert tuple(urdf.actuated_joint_names) == robot.joint_names == JOINTS
 
 
 def test_forward_kinematics_of_every_link(urdf: URDF, robot: Robot) -> None:

@@ -28,7 +28,7 @@ def test_it_holds_the_code_and_what_the_code_reads(wheel: Path) -> None:
         names = set(archive.namelist())
         (metadata,) = (name for name in names if name.endswith("entry_points.txt"))
         assert b"telebip = telebip.cli.main:main" in archive.read(metadata)
-    code = {str(path.relative_to(ROOT)) for path in ROOT.glob("telebip/**/*.py")}
+    code = {str(path.relative_to(ROOT)) for path in ROOT.glob("telebip/**/*.py")} | {"telebip/py.typed"}
     data = {f"telebip/{path.relative_to(ROOT)}" for name in ("assets", "configs") for path in ROOT.glob(f"{name}/**/*.*")}
     assert len(data) > 8
     assert {name for name in names if ".dist-info/" not in name} == code | data

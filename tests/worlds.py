@@ -12,8 +12,23 @@ from telebip.env import TelebipEnv
 MakeEnv = Callable[..., TelebipEnv]
 """Of the fixture `make_env`."""
 
-NEVER_FALL = "episode.min_hip_height=0"
+CALM = ("events.push=null", "events.friction=null", "observations.policy.noise=false")
+"""Overrides of a task that leave no disturbances."""
+NEVER_FALL = "terminations.fallen.min_hip_height=0"
 PHASE, LAST_ACTION = slice(31, 33), slice(12, 18)
+EVENTFUL = (
+    *("episode.length=0.3", "commands.resampling_time=0.1", "events.push.interval=[0.06,0.2]"),
+    *("events.push.force=150.0", "rewards.energy.k_energy=-0.3", "ppo.max_fault_rate=1.0"),
+)
+"""Overrides of a task with which all that the published one has happens within a second."""
+MORE_EVENTFUL = (
+    *EVENTFUL,
+    "observations.critic={joint_pos: {noise: 0.01}, foot_force: {}, friction: {}, push_force: {}, delay: [1, 1], history: 2}",
+    *("observations.policy.history=3", "observations.policy.delay=[0,2]", "actions.delay=[0,2]", "actions.physics_delay=[0,3]"),
+    *("rewards.energy.ramp=[0,1000]", "events.push.ramp=[10,500]"),
+    *("events.kick={lin_vel: 0.3, ang_vel: 1.0, interval: [0.06, 0.12]}", "events.mass={scale: [0.8, 1.2]}"),
+)
+"""The same with what a task may have: a critic's group, histories, delays, kicks and masses."""
 
 
 def random_actions(steps: int, num_envs: int, scale: float = 1.0, seed: int = 0) -> Tensor:

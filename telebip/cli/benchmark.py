@@ -2,36 +2,19 @@
 
 import argparse
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from telebip.cli.common import Parser, check_outputs, open_checkpoint, resolve_device
-from telebip.config import load_task, task_names
+from telebip.config import task_names
 from telebip.errors import UserError
-
-if TYPE_CHECKING:
-    from telebip.rl.checkpoint import Checkpoint
 
 EXAMPLES = """\
   benchmark.py
   benchmark.py --num-envs 4096 --rounds 20 --json speed.json --plot speed.png
-  benchmark.py --task telebip_efficient --stock                           (beside rsl-rl's own PPO in float32)
+  benchmark.py --task telebip_efficient --stock                           (beside rsl-rl's own PPO)
   benchmark.py --device cuda --num-envs 4096 16384
 """
-
-COLUMNS: dict[str, tuple[str, Callable[[float], str]]] = {
-    "worlds": ("num_envs", "{:d}".format),
-    "engine": ("engine_env_steps_per_s", "{:.0f}".format),
-    "env": ("env_env_steps_per_s", "{:.0f}".format),
-    "env/engine": ("env_over_engine", "{:.3f}".format),
-    "collect": ("collect_env_steps_per_s", "{:.0f}".format),
-    "learn": ("learn_env_steps_per_s", "{:.0f}".format),
-    "train": ("train_env_steps_per_s", "{:.0f}".format),
-    "train/stock": ("train_over_stock", "{:.2f}".format),
-    "bytes/world": ("bytes_per_env", "{:d}".format),
-}
-"""Heading of the printed table -> field of a row, and how it is written."""
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -44,26 +27,20 @@ def main(argv: Sequence[str] | None = None) -> None:
         import torch
 
         from telebip.cli.evaluate import progress_bar
-        from telebip.rl.benchmark import machine_name, measure
-        from telebip.rl.process import prepare_cpu
+        from telebip.rl.process import keep_freed_memory
         from telebip.rl.run import describe_code
         from telebip.robot import load_robot
+        from telebip.tools.benchmark import configurations, measure, shipped_for, table
+        from telebip.tools.measuring import machine_name
 
     given = options.checkpoint
-    checkpoint = open_checkpoint(given) if given else _shipped_for(options.task, options.overrides)
-    policy = given or checkpoint.path.parent.name
-    task = options.task or checkpoint.task
-    configs = [load_task(options.task or checkpoint.config, [*options.overrides, f"num_envs={n}"]) for n in options.num_envs]
-    if configs[0].ppo.symmetry != checkpoint.config.ppo.symmetry:
-        raise UserError(
-            f"checkpoint '{checkpoint.path}' has ppo.symmetry={checkpoint.config.ppo.symmetry}, and task '{task}' has "
-            f"{configs[0].ppo.symmetry}; choose a --checkpoint that was trained like the task"
-        )
+    checkpoint = open_checkpoint(given) if given else shipped_for(options.task, options.overrides)
+    task, policy = options.task or checkpoint.task, given or checkpoint.path.parent.name
+    configs = configurations(options.task, checkpoint, options.overrides, options.num_envs)
     device = resolve_device(options.device)
-    threads = torch.get_num_threads()
     if device.type == "cpu":
-        prepare_cpu()
-    robot = load_robot(configs[0].sim.robot)
+        keep_freed_memory()
+    robot, machine, threads = load_robot(configs[0].sim.robot), machine_name(device), torch.get_num_threads()
 
     rows, done, total = [], 0, (options.rounds + 1) * sum(options.num_envs)
     with progress_bar(console) as show:
@@ -75,14 +52,12 @@ def main(argv: Sequence[str] | None = None) -> None:
                 show("measuring", done, total)
 
             show("measuring", done, total)
-            stock_threads = threads if options.stock else 0
-            rows.append(measure(config, robot, device, options.backend, checkpoint, options.rounds, stock_threads, progress))
+            rows.append(measure(config, robot, device, options.backend, checkpoint, options.rounds, options.stock, progress))
             if not console.is_terminal:
                 console.print(f"measured {config.num_envs} worlds")
 
-    machine = machine_name(device)
     console.print(
-        f"{task} on {machine} ({rows[0]['backend']}), torch threads: {threads}, update in {rows[0]['update']}; "
+        f"{task} on {machine} ({rows[0]['backend']}), torch threads: {threads}, networks in {rows[0]['arithmetic']}; "
         f"environment steps per second, medians of {options.rounds} rounds"
     )
     console.print(table(rows))
@@ -95,27 +70,6 @@ def main(argv: Sequence[str] | None = None) -> None:
 
         throughput(rows, f"{task} on {machine}").savefig(options.plot, dpi=150, bbox_inches="tight")
         console.print(f"wrote {options.plot}")
-
-
-def _shipped_for(task: str | None, overrides: Sequence[str]) -> "Checkpoint":
-    """Return the policy of `assets/policies` that walks in a task: its own, or one that learned as much of the gait."""
-    from telebip.rl.checkpoint import POLICIES
-
-    symmetry = load_task(task or "telebip_flat", overrides).ppo.symmetry
-    for name in (Path(task or "").stem, "telebip_flat"):
-        if (POLICIES / name / "policy.pt").is_file():
-            checkpoint = open_checkpoint(POLICIES / name)
-            if checkpoint.config.ppo.symmetry == symmetry:
-                return checkpoint
-    return open_checkpoint(POLICIES / "telebip_efficient")
-
-
-def table(rows: Sequence[dict[str, Any]]) -> str:
-    """Return the rows as text, a column for each of `COLUMNS` that they have."""
-    columns = {heading: (field, form) for heading, (field, form) in COLUMNS.items() if field in rows[0]}
-    lines = [list(columns), *([form(row[field]) for field, form in columns.values()] for row in rows)]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True)) for line in lines)
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -141,7 +95,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         help="the policy that walks (default: what comes with telebip for the task, or telebip_flat)",
     )
     parser.add_argument("--rounds", type=int, default=8, metavar="N", help="measurements of each number (default: 8)")
-    parser.add_argument("--stock", action="store_true", help="measure training with rsl-rl's own PPO in float32 too")
+    parser.add_argument("--stock", action="store_true", help="measure training with rsl-rl's own PPO too")
     parser.add_argument("--json", metavar="FILE", help="write everything that was measured")
     parser.add_argument("--plot", metavar="FILE", help="draw the rates over the number of worlds (.png, .svg or .pdf)")
     parser.add_argument("overrides", nargs="*", metavar="key.path=value", help="override any field of the task")

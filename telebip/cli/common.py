@@ -8,12 +8,15 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
+from telebip import ROOT
 from telebip.errors import UserError, is_out_of_memory, nearest
 from telebip.viz.opengl import check_opengl
 
 if TYPE_CHECKING:
     import torch
 
+    from telebip.control.policy import Policy
+    from telebip.env import TelebipEnv
     from telebip.rl.checkpoint import Checkpoint
 
 
@@ -26,8 +29,9 @@ class Parser(argparse.ArgumentParser):
 
     def __init__(self, description: str, examples: str) -> None:
         """Create a parser; `examples`, one a line as in `play.py --agent zero`, close the `--help` text."""
+        program = Path(sys.argv[0])
         super().__init__(
-            prog=" ".join(["telebip", *sys.argv[1:2]]) if _is_telebip() else None,
+            prog=" ".join([program.name, *sys.argv[1:2]]) if program.stem == "telebip" or _is_own_script(program) else None,
             description=description,
             epilog="examples:\n" + re.sub(r"^  (\w+)\.py", lambda m: f"  {invocation(m[1])}", examples, flags=re.MULTILINE),
             formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -47,21 +51,20 @@ class Parser(argparse.ArgumentParser):
         raise UserError(f"{message} (see {self.prog} --help)")
 
 
-def invocation(command: str, own: bool = False) -> str:
-    """Return what to type for a command: `telebip play` where that is how this one was started, else its script.
-
-    The program's `own` command may be reached by a script of the user's, as one with rewards of theirs; then it is that.
-    """
-    if _is_telebip():
+def invocation(command: str) -> str:
+    """Return what to type for a command, as this one was started: `telebip play`, a script of the user's, or ours."""
+    program = Path(sys.argv[0])
+    if program.stem == "telebip":
         return f"telebip {command}"
-    script = Path(sys.argv[0])
-    if own and script.suffix == ".py" and not Path(__file__).with_name(script.name).exists():
-        return f"python {script}"
-    return f"python scripts/{command}.py"
+    return f"python {program} {command}" if _is_own_script(program) else f"python scripts/{command}.py"
 
 
-def _is_telebip() -> bool:
-    return Path(sys.argv[0]).stem == "telebip"
+def _is_own_script(program: Path) -> bool:
+    """Whether the program is a script of the user's that calls `telebip.cli.main.main`, with terms of their own."""
+    is_ours = program.stem == "__main__" or any(
+        (ROOT / folder / program.name).is_file() for folder in ("scripts", "telebip/cli")
+    )
+    return program.suffix == ".py" and not is_ours
 
 
 def run(command: Callable[[], None]) -> NoReturn:
@@ -100,8 +103,31 @@ def open_checkpoint(path: str | Path) -> "Checkpoint":
     return checkpoint
 
 
+def open_policy(path: str | Path) -> "Checkpoint":
+    """Do what `open_checkpoint` does for a policy that is to walk, and say which terms of its task are left out.
+
+    Those are terms of the user's own that this process does not know; walking needs no rewards, which are passed over.
+    """
+    checkpoint = open_checkpoint(path)
+    if unknown := [name for name in checkpoint.missing if not name.startswith("rewards.")]:
+        print(f"note: '{checkpoint.path}' is walked without {', '.join(unknown)}, unknown here", file=sys.stderr)
+    return checkpoint
+
+
+def policy_of(checkpoint: "Checkpoint", env: "TelebipEnv") -> "Policy":
+    """Return a checkpoint's policy, to walk in `env`.
+
+    Raises:
+        UserError: the robot or the observations are others than those it was trained on.
+    """
+    from telebip.rl.policy import load_policy, require_fit
+
+    require_fit(checkpoint, env)
+    return load_policy(checkpoint, env.device)
+
+
 def check_connect(options: argparse.Namespace) -> None:
-    """Refuse a `--connect` that no `--viewer` heeds.
+    """Refuse a `--connect` without a `--viewer rerun`.
 
     Raises:
         UserError: it is one.

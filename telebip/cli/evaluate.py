@@ -9,7 +9,7 @@ from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 
-from telebip.cli.common import CONTROLLERS, Parser, open_checkpoint, resolve_device
+from telebip.cli.common import CONTROLLERS, Parser, open_policy, policy_of, resolve_device
 from telebip.config import load_task
 from telebip.errors import UserError
 
@@ -40,11 +40,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     check_overrides(options.overrides, suites)
     device = resolve_device(options.device)
     if options.controller:
-        subject = controller_subject(options.controller, options.label, options.overrides)
+        candidate = controller_candidate(options.controller, options.label, options.overrides)
     else:
-        subject = subject_of(options.checkpoint, options.label, options.overrides)
+        candidate = checkpoint_candidate(options.checkpoint, options.label, options.overrides)
     push = PushProtocol(max_force=options.max_force, worlds=options.push_worlds)
-    subject = replace(subject, source=" ".join([subject.source, *options.given]))
+    candidate = replace(candidate, source=" ".join([candidate.source, *options.given]))
     protocol = Protocol(
         worlds=options.num_envs,
         duration=options.duration,
@@ -54,13 +54,14 @@ def main(argv: Sequence[str] | None = None) -> None:
         device=device,
         backend=options.backend,
     )
-    robot = load_robot(subject.config.sim.robot)
-    out = Path(options.out) if options.out else default_folder(subject.label)
+    robot = load_robot(candidate.task.sim.robot)
+    out = Path(options.out) if options.out else default_folder(candidate.label)
     make_folder(out)
     with progress_bar(console) as show:
-        results = evaluate(subject, robot, suites, protocol, show)
+        results = evaluate(candidate, robot, suites, protocol, show)
     write_results(results, out)
-    write_report([results], out, f"{subject.label}: how it walks", f"Measured by: {subject.source}", references=references())
+    title, text = f"{candidate.label}: how it walks", f"Measured by: {candidate.source}"
+    write_report([results], out, title, text, references=references())
     lines = (out / "report.md").read_text(encoding="utf-8").splitlines()
     console.print("\n".join(line for line in lines if not line.startswith("![")))
     console.print(f"wrote {out}/results.json, report.md with its pictures, and report.html")
@@ -82,39 +83,40 @@ def check_overrides(overrides: Sequence[str], suites: Sequence[str]) -> None:
         key = override.partition("=")[0]
         if key in SET_HERE:
             raise UserError(f"'{override}' cannot be overridden here; use {SET_HERE[key]}")
-        if "push" in suites and (key == "episode.reset_heading" or key.startswith("disturbance.push.")):
+        is_own = key.split(".")[:2] == ["events", "push"] or key in ("events.start_pose", "events.start_pose.heading")
+        if "push" in suites and is_own:
             raise UserError(f"the push suite has its own pushes, of robots that face x; '{override}' goes with other suites")
 
 
-def controller_subject(name: str, label: str | None, overrides: Sequence[str] = ()):
-    """Return a model-based walker as a subject of the evaluator, with `overrides` of its parameters and of the task."""
+def controller_candidate(name: str, label: str | None, overrides: Sequence[str] = ()):
+    """Return a model-based walker for the evaluator, with `overrides` of its parameters and of the task."""
     from telebip.control.config import load_controller, split_overrides
     from telebip.control.factory import make_controller
-    from telebip.eval.suites import Subject
+    from telebip.eval.suites import Candidate
 
     task, own = split_overrides(overrides)
-    config = load_task("telebip_flat", task)
-    return Subject(
+    base = load_task("telebip_flat")
+    config = load_task(base, task)
+    return Candidate(
         label=label or name,
-        config=config,
+        config=base,
         make_policy=lambda env: make_controller(name, env, own),
-        limited=False,
+        is_model_based=True,
         source=shlex.join(["evaluate.py", "--controller", name, *overrides]),
-        fingerprint=sha256(repr((name, load_controller(name, own), config.sim, config.action)).encode()).hexdigest()[:16],
+        fingerprint=sha256(repr((name, load_controller(name, own), config.sim, config.actions)).encode()).hexdigest()[:16],
         overrides=tuple(task),
     )
 
 
-def subject_of(checkpoint_path: str, label: str | None, overrides: Sequence[str] = ()):
-    """Return what a checkpoint holds as a subject of the evaluator; the label is the name of its task unless one is given."""
-    from telebip.eval.suites import Subject
-    from telebip.rl.policy import load_policy
+def checkpoint_candidate(checkpoint_path: str, label: str | None, overrides: Sequence[str] = ()):
+    """Return what a checkpoint holds for the evaluator; the label is the name of its task unless one is given."""
+    from telebip.eval.suites import Candidate
 
-    checkpoint = open_checkpoint(checkpoint_path)
-    return Subject(
+    checkpoint = open_policy(checkpoint_path)
+    return Candidate(
         label=label or checkpoint.task,
-        config=load_task(checkpoint.config, overrides),
-        make_policy=lambda env: load_policy(checkpoint, env.device),
+        config=checkpoint.config,
+        make_policy=lambda env: policy_of(checkpoint, env),
         run_dir=checkpoint.path.parent,
         source=shlex.join(["evaluate.py", "--checkpoint", checkpoint_path, *overrides]),
         fingerprint=sha256(checkpoint.path.read_bytes()).hexdigest()[:16],

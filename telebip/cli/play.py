@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from telebip.cli.common import CONTROLLERS, Parser, check_connect, open_checkpoint, resolve_device
+from telebip.cli.common import CONTROLLERS, Parser, check_connect, open_policy, policy_of, resolve_device
 from telebip.cli.evaluate import speed
 from telebip.config import TaskConfig, load_task
 from telebip.control.config import split_overrides
@@ -36,7 +36,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         return _replay(options)
     checkpoint = None
     if options.checkpoint:
-        checkpoint = open_checkpoint(options.checkpoint)
+        checkpoint = open_policy(options.checkpoint)
         task, config = checkpoint.task, checkpoint.config
     else:
         task, config = Path(options.task).stem, load_task(options.task)
@@ -53,10 +53,11 @@ def _play(options: argparse.Namespace, task: str, config: TaskConfig, command, c
 
     console = Console()
     with console.status("loading torch and the physics engine"):
+        from telebip.control.factory import with_estimate
         from telebip.env import TelebipEnv
-        from telebip.eval.rollout import roll_out
         from telebip.eval.walk import summarise
         from telebip.robot import load_robot
+        from telebip.rollout import roll_out
 
     if options.viewer == "rerun":
         from telebip.viz.rerun import require_viewer
@@ -68,7 +69,7 @@ def _play(options: argparse.Namespace, task: str, config: TaskConfig, command, c
     _warn_untrained(console, command, checkpoint)
     rollouts = []
     for name in ["RL" if checkpoint else options.controller or options.agent, *options.beside]:
-        env = TelebipEnv(config, robot, device, options.backend)
+        env = TelebipEnv(with_estimate(config) if name in CONTROLLERS else config, robot, device, options.backend)
         env.set_command(*command)
         overrides = options.control_overrides if name == options.controller else []
         policy = _policy(checkpoint if name == "RL" else name, env, overrides)
@@ -101,9 +102,9 @@ def _replay(options: argparse.Namespace) -> None:
     console.print(f"{options.replay}: {fault.kind}, {describe(fault.record)}, on {fault.backend}; repeated on {backend}")
     console.print(f"  {'physics step':>12}{'hip height [m]':>16}{'max |qvel|':>12}{'max force':>12}  faults")
     for step, (state, faults) in enumerate(zip(done.states, done.faults, strict=True)):
-        row = f"{state.base_pos[0, 2]:16.4f}{state.qvel.abs().max():12.4g}{state.joint_force.abs().max():12.4g}"
+        row = f"{state['qpos'][0, 2]:16.4f}{state['qvel'].abs().max():12.4g}{state['joint_force'].abs().max():12.4g}"
         console.print(f"  {step if step else 'before':>12}{row}  {', '.join(sorted(faults)) or '-'}")
-    action, push = fault.record["action"].tolist(), fault.record["push_wrench_w"].tolist()
+    action, push = fault.record["action"].tolist(), fault.record["wrench_w"].tolist()
     console.print(f"  action        {' '.join(f'{a:.4g}' for a in action)}")
     console.print(f"  push          {' '.join(f'{p:.4g}' for p in push[:3])} N")
     console.print("reproduced" if done.reproduces(fault.kind) else f"not reproduced on {backend}")
@@ -116,12 +117,12 @@ def _show(console, options: argparse.Namespace, rollouts, robot) -> None:
 
     from telebip.viz.scene import line_up
 
-    actors, urdf = line_up(rollouts, worlds=options.show), robot.path.with_suffix(".urdf")
+    actors = line_up(rollouts, worlds=options.show)
     file = Path(options.record) if options.record else None
     if file and file.suffix == ".rrd":
         from telebip.viz.rerun import record
 
-        record(actors, urdf, file)
+        record(actors, robot, file)
         console.print(f"recorded {file}; look at it with: rerun {file}")
     elif file and file.suffix == ".png":
         from telebip.viz.picture import strobe
@@ -138,7 +139,7 @@ def _show(console, options: argparse.Namespace, rollouts, robot) -> None:
     if options.viewer == "rerun":
         from telebip.viz.rerun import show
 
-        show(actors, urdf, options.connect)
+        show(actors, robot, options.connect)
         console.print("shown in the rerun viewer")
 
 
@@ -151,7 +152,6 @@ def _policy(who, env, overrides: Sequence[str]):
 
     from telebip.control.factory import make_controller
     from telebip.control.policy import Stateless
-    from telebip.rl.policy import load_policy
 
     if who in CONTROLLERS:
         return make_controller(who, env, overrides)
@@ -161,7 +161,7 @@ def _policy(who, env, overrides: Sequence[str]):
         return Stateless(lambda obs: torch.zeros(shape, device=env.device))
     if who == "random":
         return Stateless(lambda obs: torch.randn(shape, generator=env.generator, device=env.device))
-    return load_policy(who, env.device)
+    return policy_of(who, env)
 
 
 def _lines(s) -> str:
@@ -183,7 +183,7 @@ def _lines(s) -> str:
 def _command(given: Sequence[float] | None, config: TaskConfig) -> tuple[float, float, float]:
     if given:
         return (given[0], given[1], given[2])
-    ranges = (config.command.lin_vel_x, config.command.lin_vel_y, config.command.ang_vel_z)
+    ranges = (config.commands.lin_vel_x, config.commands.lin_vel_y, config.commands.ang_vel_z)
     return tuple(0.5 * (low + high) for low, high in ranges)  # type: ignore[return-value]
 
 
@@ -191,7 +191,7 @@ def _warn_untrained(console, command: tuple[float, float, float], checkpoint) ->
     """Say so if the policy never saw such a command in training."""
     if checkpoint is None:
         return
-    trained = checkpoint.config.command
+    trained = checkpoint.config.commands
     names = ("forward speed", "leftward speed", "yaw rate")
     ranges = (trained.lin_vel_x, trained.lin_vel_y, trained.ang_vel_z)
     slack = (0.0, 0.0, trained.heading_limit if trained.heading_gain > 0 else 0.0)
@@ -242,7 +242,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         help="m/s forward, m/s left, rad/s (default: the middle of the task's ranges)",
     )
     parser.add_argument("--duration", type=float, default=20.0, metavar="S", help="seconds to walk (default: 20)")
-    parser.add_argument("--num-envs", metavar="N", default="1", help="worlds; they differ in their start (default: 1)")
+    parser.add_argument("--num-envs", type=int, default=1, metavar="N", help="worlds; they differ in their start (default: 1)")
     parser.add_argument("--disturb", action="store_true", help="keep the task's pushes, friction and observation noise on")
     parser.add_argument("--viewer", choices=("none", "rerun", "mujoco"), default="none", help="see it at once (default: none)")
     parser.add_argument("--connect", metavar="HOST:PORT", help="a running rerun viewer (default: start one here)")
@@ -270,8 +270,9 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         raise UserError(f"--duration must be between 0 and 3600 s, got {options.duration:g}")
     if options.record and Path(options.record).suffix not in SUFFIXES:
         raise UserError(f"--record writes one of FILE{', FILE'.join(SUFFIXES)}, got '{options.record}'")
-    if options.show < 1:
-        raise UserError(f"--show must be at least 1, got {options.show}")
+    for name in ("num_envs", "show"):
+        if getattr(options, name) < 1:
+            raise UserError(f"--{name.replace('_', '-')} must be at least 1, got {getattr(options, name)}")
     if options.replay:
         _check_replay(parser, options)
     for name in ("record", "beside"):

@@ -4,10 +4,11 @@ import argparse
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from telebip.cli.common import Parser, check_outputs, resolve_device
-from telebip.config import load_task, task_names
+from telebip.config import check, load_task, task_names
 from telebip.errors import UserError
 
 EXAMPLES = """\
@@ -28,17 +29,17 @@ def main(argv: Sequence[str] | None = None) -> None:
 
         from telebip.cli.evaluate import progress_bar
         from telebip.eval import plots
-        from telebip.rl.benchmark import machine_name
-        from telebip.rl.process import prepare_cpu
-        from telebip.rl.race import RACERS, race, verdict
+        from telebip.rl.process import keep_freed_memory
         from telebip.rl.run import describe_code
         from telebip.robot import load_robot
+        from telebip.tools.measuring import machine_name
+        from telebip.tools.race import RACERS, race, sentence, verdict
 
     first = load_task(options.task, options.overrides)
-    configs = [load_task(options.task, [*options.overrides, f"seed={first.seed + k}"]) for k in range(options.seeds)]
+    configs = [check(replace(first, seed=first.seed + k)) for k in range(options.seeds)]
     device, threads = resolve_device(options.device), torch.get_num_threads()
     if device.type == "cpu":
-        prepare_cpu()
+        keep_freed_memory()
     robot, machine = load_robot(first.sim.robot), machine_name(device)
     iterations = -(-options.samples // (first.num_envs * first.ppo.num_steps_per_env))
 
@@ -52,18 +53,18 @@ def main(argv: Sequence[str] | None = None) -> None:
 
         show("training", 0, iterations * len(configs))
         for config in configs:
-            races.append(race(config, robot, device, options.backend, options.samples, threads, progress))
+            races.append(race(config, robot, device, options.backend, options.samples, progress))
             if None in (races[-1][name]["episode_return"][-1] for name in RACERS):
                 raise UserError(f"no episode has ended after {races[-1]['samples'][-1]} samples; give more --samples")
-            console.print(f"seed {config.seed}: {_sentence(verdict(races[-1:]))}")
+            console.print(f"seed {config.seed}: {sentence(verdict(races[-1:]))}")
             if options.json:  # after every seed: nothing is lost
                 about = {"machine": machine, "threads": threads, "task": options.task, "num_envs": first.num_envs}
                 content = {**about, "device": str(device), **describe_code(), "verdict": verdict(races), "races": races}
                 Path(options.json).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
-    found, title = verdict(races), f"{options.task}, {first.num_envs} worlds, update in {races[0]['update']}"
+    found, title = verdict(races), f"{options.task}, {first.num_envs} worlds, networks in {races[0]['arithmetic']}"
     console.print(f"{title}, {found['samples']:,} samples on {machine} ({races[0]['backend']}), torch threads: {threads}")
-    console.print(f"{len(races)} seed{'s' * (len(races) > 1)}: {_sentence(found)}")
+    console.print(f"{len(races)} seed{'s' * (len(races) > 1)}: {sentence(found)}")
     if options.json:
         console.print(f"wrote {options.json}")
     if options.plot:
@@ -71,19 +72,10 @@ def main(argv: Sequence[str] | None = None) -> None:
         console.print(f"wrote {options.plot}")
 
 
-def _sentence(found: dict) -> str:
-    """Return a verdict in words."""
-    intervals = found["episode_return"].values()
-    own, stock = (f"{low:.2f}" if low == high else f"{low:.2f} to {high:.2f}" for low, high in intervals)
-    meet = "they overlap" if found["overlap"] else "they do not overlap"
-    meet = f" ({meet})" if any(low < high for low, high in intervals) else ""
-    return f"return {own}, rsl-rl's {stock}{meet}; {found['train_over_stock']:.2f} times as fast"
-
-
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = Parser(
-        "Train from scratch with telebip's learner and with rsl-rl's PPO as it stands, in float32. Both have worlds of their "
-        "own, the same seeds and as many samples, and their iterations alternate: ratios of times hold on a busy machine.",
+        "Train from scratch with telebip's learner and with rsl-rl's PPO as it stands, on the same networks. Both have worlds "
+        "of their own, the same seeds and as many samples, and their iterations alternate: ratios hold on a busy machine.",
         EXAMPLES,
     )
     parser.add_argument("--task", default="telebip_flat", metavar="NAME", help=f"{', '.join(task_names())}, or a YAML file")

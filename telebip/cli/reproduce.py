@@ -2,10 +2,11 @@
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from telebip.cli.common import Parser, open_checkpoint, resolve_device
-from telebip.cli.evaluate import controller_subject, progress_bar, references, subject_of
+from telebip.cli.evaluate import checkpoint_candidate, controller_candidate, progress_bar, references
 from telebip.config import load_task
 from telebip.errors import UserError, nearest
 
@@ -50,11 +51,11 @@ def main(argv: Sequence[str] | None = None) -> None:
                 name, label = training.name, training.label
                 if seed > 1:
                     name, label = f"{name}-seed{seed}", f"{label}, seed {seed}"
-                _measure(console, out / name, training, options, subject_of(str(run_dir), label))
+                _measure(console, out / name, training, options, checkpoint_candidate(str(run_dir), label))
     for baseline in BASELINES:
         if not options.only or baseline.name in options.only:
-            subject = controller_subject(baseline.controller, baseline.label, baseline.overrides)
-            _measure(console, out / baseline.name, baseline, options, subject)
+            candidate = controller_candidate(baseline.controller, baseline.label, baseline.overrides)
+            _measure(console, out / baseline.name, baseline, options, candidate)
     results = {name: [_read(file) for file in _measured(out, name, seeds=not options.shipped)] for name in names}
     seeds = [f"{t.label} ({n} seed{'s' if n > 1 else ''})" for t in TRAININGS if (n := len(results[t.name]))]
     text = INTRODUCTION.format(trainings=", ".join(seeds) or "none")
@@ -84,10 +85,11 @@ def _read(file: Path):
 
 def _train(console, training, seed: int, options: argparse.Namespace) -> Path | None:
     """Train, or go on training, one policy; return its run folder, or None if the user stopped it."""
-    from telebip.cli.train import train
+    from telebip.cli.train import Start, train
 
     run_dir = Path(options.runs) / f"{training.name}-seed{seed}"
-    config = load_task(training.task, [f"seed={seed}", *training.overrides, *(QUICK_TRAINING if options.quick else ())])
+    config = load_task(training.task, [*training.overrides, *(QUICK_TRAINING if options.quick else ())])
+    config = replace(config, seed=seed)
     checkpoint = open_checkpoint(run_dir) if any(run_dir.glob("model_*.pt")) else None
     if checkpoint and checkpoint.iteration >= config.ppo.max_iterations:
         console.print(f"{training.name}, seed {seed}: trained already, {checkpoint.samples / 1e6:.1f} M samples in {run_dir}")
@@ -97,10 +99,11 @@ def _train(console, training, seed: int, options: argparse.Namespace) -> Path | 
     except OSError as error:
         raise UserError(f"cannot write to '{run_dir}': {error.strerror or error}") from error
     console.print(f"{training.name}, seed {seed}: training in {run_dir}")
-    return run_dir if train(training.task, config, run_dir, checkpoint, options.device) else None
+    start = Start(training.task, config, run_dir=run_dir, checkpoint=checkpoint)
+    return run_dir if train(start, options.device) else None
 
 
-def _measure(console, out: Path, walker, options: argparse.Namespace, subject) -> None:
+def _measure(console, out: Path, walker, options: argparse.Namespace, candidate) -> None:
     """Measure one walker, unless complete results of the same policy or parameters, measured in the same way, are there."""
     from telebip.eval.report import make_folder, write_results
     from telebip.eval.suites import Protocol, evaluate
@@ -108,22 +111,22 @@ def _measure(console, out: Path, walker, options: argparse.Namespace, subject) -
 
     protocol = _quick_protocol() if options.quick else Protocol(device=resolve_device(options.device))
     file = out / "results.json"
-    if not options.again and _is_current(file, subject, walker.suites, protocol):
+    if not options.again and _is_current(file, candidate, walker.suites, protocol):
         console.print(f"{walker.name}: measured already")
         return
     make_folder(out)
     with progress_bar(console) as show:
-        results = evaluate(subject, load_robot(subject.config.sim.robot), walker.suites, protocol, show)
+        results = evaluate(candidate, load_robot(candidate.task.sim.robot), walker.suites, protocol, show)
     write_results(results, out)
     console.print(f"{walker.name}: measured, see {file}")
 
 
-def _is_current(file: Path, subject, suites: Sequence[str], protocol) -> bool:
+def _is_current(file: Path, candidate, suites: Sequence[str], protocol) -> bool:
     """Whether a file holds what would be measured again; a missing, damaged or older one does not."""
     from telebip.eval.suites import is_current
 
     try:
-        return file.is_file() and is_current(_read(file), subject, suites, protocol)
+        return file.is_file() and is_current(_read(file), candidate, suites, protocol)
     except UserError:
         return False
 

@@ -2,8 +2,9 @@
 
 import argparse
 import signal
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,7 +13,10 @@ from telebip.config import TaskConfig, load_task, task_names
 from telebip.errors import UserError
 
 if TYPE_CHECKING:
+    from telebip.cli.console import Console
     from telebip.rl.checkpoint import Checkpoint
+    from telebip.rl.distributed import Ranks
+    from telebip.rl.train import Trainer
     from telebip.sim import Backend
 
 EXAMPLES = """\
@@ -23,61 +27,76 @@ EXAMPLES = """\
   tensorboard --logdir runs
 """
 
+Report = Callable[[dict[str, float]], None]
+"""Takes what TensorBoard gets of an iteration."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """What to train, and where it goes."""
+
+    task: str  # its name
+    config: TaskConfig
+    run_dir: Path | None = None  # the run's folder, which must exist; None makes a new one in `log_dir`
+    log_dir: Path = Path("runs")
+    checkpoint: "Checkpoint | None" = None  # where to go on from
+
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Parse arguments and train."""
     options = _parse(argv)
-    overrides = [
-        f"{key}={value}"
-        for key, value in (
-            ("num_envs", options.num_envs),
-            ("ppo.max_iterations", options.max_iterations),
-            ("seed", options.seed),
-        )
-        if value is not None
-    ] + options.overrides
+    start = _resumed(options) if options.resume else _new(options)
+    train(start, options.device, options.backend, options.viewer == "rerun", options.connect)
 
-    if options.resume:
-        checkpoint = open_checkpoint(options.resume)
-        if options.task and Path(options.task).stem != checkpoint.task:
-            raise UserError(f"checkpoint '{checkpoint.path}' is of task '{checkpoint.task}', not of '{options.task}'")
-        if "optimizer_state_dict" not in checkpoint.learner:
-            raise UserError(f"checkpoint '{checkpoint.path}' holds the policy alone; resume from a model_<iteration>.pt")
-        task, config = checkpoint.task, load_task(checkpoint.config, overrides)
-        if config.seed != checkpoint.config.seed:
-            raise UserError(
-                f"--resume goes on with the checkpoint's generators, of seed {checkpoint.config.seed}; leave out the seed "
-                f"{config.seed}, or start a new run with it"
-            )
-        run_dir: str | Path = checkpoint.path.resolve().parent
-    elif options.task:
-        checkpoint, task, config = None, Path(options.task).stem, load_task(options.task, overrides)
-        run_dir = options.log_dir or "runs"
-    else:
+
+def _new(options: argparse.Namespace) -> Start:
+    """Return the start of a new run."""
+    if not options.task:
         raise UserError(f"which task? --task {{{','.join(task_names())}}}, or --resume a run")
-    train(task, config, run_dir, checkpoint, options.device, options.backend, options.viewer == "rerun", options.connect)
+    config = load_task(options.task, _overrides(options))
+    return Start(Path(options.task).stem, config, log_dir=Path(options.log_dir or "runs"))
+
+
+def _resumed(options: argparse.Namespace) -> Start:
+    """Return where a run goes on, in its own folder.
+
+    Raises:
+        UserError: the checkpoint is no place to go on from, or something asked for is not its own.
+    """
+    checkpoint = open_checkpoint(options.resume)
+    from telebip.rl.resume import require_complete
+
+    if options.task and Path(options.task).stem != checkpoint.task:
+        raise UserError(f"checkpoint '{checkpoint.path}' is of task '{checkpoint.task}', not of '{options.task}'")
+    require_complete(checkpoint)
+    config = load_task(checkpoint.config, _overrides(options))
+    if config.seed != checkpoint.config.seed:
+        raise UserError(
+            f"--resume goes on with the checkpoint's generators, of seed {checkpoint.config.seed}; leave out the seed "
+            f"{config.seed}, or start a new run with it"
+        )
+    return Start(checkpoint.task, config, run_dir=checkpoint.path.resolve().parent, checkpoint=checkpoint)
+
+
+def _overrides(options: argparse.Namespace) -> list[str]:
+    named = {"num_envs": options.num_envs, "ppo.max_iterations": options.max_iterations, "seed": options.seed}
+    return [f"{key}={value}" for key, value in named.items() if value is not None] + options.overrides
 
 
 def train(
-    task: str,
-    config: TaskConfig,
-    folder: str | Path,
-    checkpoint: "Checkpoint | None" = None,
+    start: Start,
     device_name: str = "auto",
     backend: "Backend" = "auto",
-    watched: bool = False,
+    is_watched: bool = False,
     connect: str | None = None,
 ) -> bool:
     """Train with progress and logs until the end or Ctrl-C.
 
     Args:
-        task: its name.
-        config: what to train.
-        folder: the run's own, as a `Path`; or, as a text, where to make one.
-        checkpoint: where to go on from.
+        start: what to train, and where.
         device_name: as `resolve_device` takes it.
         backend: physics engine.
-        watched: whether to show the training in the rerun viewer.
+        is_watched: whether to show the training in the rerun viewer.
         connect: address of a running viewer.
 
     Returns:
@@ -87,72 +106,106 @@ def train(
     from telebip.rl.distributed import Ranks, joined
 
     ranks = Ranks.from_environment()
-    console = Console(quiet=not ranks.is_main)
+    console, is_watched = Console(quiet=not ranks.is_main), is_watched and ranks.is_main
     with console.status("loading torch and the physics engine"):
-        from telebip.env import TelebipEnv
-        from telebip.rl.checkpoint import require_unchanged, set_aside_newer
-        from telebip.rl.curve import rows_so_far
-        from telebip.rl.process import prepare_cpu
-        from telebip.rl.run import create_run_dir, describe_run, exclusive, read_starts, require_space
-        from telebip.rl.train import Trainer
-        from telebip.robot import load_robot
-
-    if watched and ranks.is_main:
+        from telebip.rl.process import keep_freed_memory
+    if is_watched:
         from telebip.viz.rerun import require_viewer
 
         require_viewer(connect)
     device = resolve_device(ranks.device_name(device_name))
     if device.type == "cpu":
-        prepare_cpu()
+        keep_freed_memory()
     with joined(ranks, device), ExitStack() as stack:
-        robot = load_robot(config.sim.robot)
         with console.status("creating the worlds (the warp backend compiles for a minute or two the first time)"):
-            env = TelebipEnv(load_task(config, [f"seed={config.seed + ranks.rank}"]), robot, device, backend)
-            trainer = Trainer(env, task, Path(), ranks, note=lambda line: console.print(f"note: {line}"))
-            run_dir = Path()
-            if ranks.is_main:  # after all that may be refused, so that this leaves no empty folder
-                run_dir = folder if isinstance(folder, Path) else create_run_dir(Path(folder), task)
-                stack.enter_context(exclusive(run_dir))
-                require_unchanged(run_dir, checkpoint)
-                rows_so_far(run_dir)  # whole, or refused before anything is changed; so is the next
-                read_starts(run_dir)
-                trainer.run_dir = run_dir
-        restart = trainer.resume(checkpoint) if checkpoint else ""
-        total = config.ppo.max_iterations
+            trainer = _make_trainer(start, ranks, str(device), backend, console)
+        if ranks.is_main:  # after all that may be refused, so that this leaves no empty folder
+            trainer.run_dir = stack.enter_context(_own_folder(start))
+        restart = trainer.resume(start.checkpoint) if start.checkpoint else ""
+        total = start.config.ppo.max_iterations
         if trainer.iteration >= total:
-            console.print(f"{run_dir} has finished its {total} iterations; raise --max-iterations to train on")
+            console.print(f"{trainer.run_dir} has finished its {total} iterations; raise --max-iterations to train on")
             return True
-        engine = env.sim.backend
         if ranks.is_main:
-            require_space(run_dir, trainer.checkpoint_bytes(), config.ppo.keep_checkpoints)
-            for file in set_aside_newer(run_dir, trainer.iteration):
-                console.print(f"note: {file.name} is from after the checkpoint to go on from, and is in {file.parent} now")
-            describe_run(run_dir, config, str(device), engine, ranks.size)
-        worlds = f"{config.num_envs} worlds" if ranks.size == 1 else f"{ranks.size} processes x {config.num_envs} worlds"
-        console.print(f"{task}: {worlds} on {device} ({engine}), update in {trainer.arithmetic}, writing to {run_dir}")
-        if trainer.iteration:
-            console.print(f"resuming after iteration {trainer.iteration} of {total}")
-        if restart:
-            console.print(f"note: the worlds start new episodes, as {restart}")
-
+            _prepare_folder(trainer, console)
+        _announce(trainer, console, restart)
         stop = stack.enter_context(stop_on_signal(console))
-        show = watch = stack.enter_context(progress_bar(console, trainer))
-        if watched and ranks.is_main:
+        report = stack.enter_context(progress_bar(console, trainer))
+        if is_watched:
             from telebip.viz.live import live_view
 
-            live = stack.enter_context(live_view(trainer, connect))
-
-            def watch(scalars: dict[str, float]) -> None:
-                show(scalars)
-                live(scalars)
-
-        trainer.learn(stop, watch)
+            report = _both(report, stack.enter_context(live_view(trainer, connect)))
+        trainer.learn(stop, report)
     finished = trainer.iteration >= total
     if not finished:
-        again = f"{invocation('train', own=True)} --resume {run_dir}"
+        again = f"{invocation('train')} --resume {trainer.run_dir}"
         console.print(f"stopped after iteration {trainer.iteration} of {total}; go on with: {again}")
-    console.print(f"see it walk: {invocation('play')} --checkpoint {run_dir}")
+    console.print(f"see it walk: {invocation('play')} --checkpoint {trainer.run_dir}")
     return finished
+
+
+def _make_trainer(start: Start, ranks: "Ranks", device: str, backend: "Backend", console: "Console") -> "Trainer":
+    """Create this process's worlds, of a seed of their own, and its learner."""
+    from telebip.env import TelebipEnv
+    from telebip.rl.train import Trainer
+    from telebip.robot import load_robot
+
+    config = replace(start.config, seed=start.config.seed + ranks.rank)
+    env = TelebipEnv(config, load_robot(config.sim.robot), device, backend)
+    return Trainer(env, start.task, Path(), ranks, note=lambda line: console.print(f"note: {line}"))
+
+
+@contextmanager
+def _own_folder(start: Start) -> Iterator[Path]:
+    """Yield the run's folder, which no other process trains in meanwhile.
+
+    Raises:
+        UserError: another one does or did so since the checkpoint was loaded, or a file that the run goes on with is damaged.
+    """
+    from telebip.rl.checkpoint import require_unchanged
+    from telebip.rl.curve import rows_so_far
+    from telebip.rl.run import create_run_dir, exclusive, read_starts
+
+    run_dir = start.run_dir or create_run_dir(start.log_dir, start.task)
+    with exclusive(run_dir):
+        require_unchanged(run_dir, start.checkpoint)
+        rows_so_far(run_dir)  # whole, or refused before anything is changed; so is the next
+        read_starts(run_dir)
+        yield run_dir
+
+
+def _prepare_folder(trainer: "Trainer", console: "Console") -> None:
+    """Make the run's folder ready to be written to from the trainer's iteration on."""
+    from telebip.rl.checkpoint import set_aside_newer
+    from telebip.rl.run import describe_run, require_space
+
+    run_dir, env = trainer.run_dir, trainer.env
+    require_space(run_dir, trainer.checkpoint_bytes(), env.cfg.ppo.keep_checkpoints)
+    for file in set_aside_newer(run_dir, trainer.iteration):
+        console.print(f"note: {file.name} is from after the checkpoint to go on from, and is in {file.parent} now")
+    describe_run(run_dir, env.cfg, str(env.device), env.sim.backend, trainer.ranks.size)
+
+
+def _announce(trainer: "Trainer", console: "Console", restart: str) -> None:
+    """Print what is trained, how and where."""
+    env, size = trainer.env, trainer.ranks.size
+    worlds = f"{env.num_envs} worlds" if size == 1 else f"{size} processes x {env.num_envs} worlds"
+    console.print(
+        f"{trainer.task}: {worlds} on {env.device} ({env.sim.backend}), update in {trainer.arithmetic}, "
+        f"writing to {trainer.run_dir}"
+    )
+    if trainer.iteration:
+        console.print(f"resuming after iteration {trainer.iteration} of {env.cfg.ppo.max_iterations}")
+    if restart:
+        console.print(f"note: the worlds start new episodes, as {restart}")
+
+
+def _both(first: Report, second: Report) -> Report:
+    def report(scalars: dict[str, float]) -> None:
+        first(scalars)
+        second(scalars)
+
+    return report
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:

@@ -1,25 +1,21 @@
 """From YAML files and overrides to a validated configuration, and back to text."""
 
 import dataclasses
-import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from telebip import ROOT
 from telebip.config.schema import TaskConfig
+from telebip.config.tree import Dumper, Entry, Tree, entry_of, merge, plain, read
+from telebip.config.validation import KINDS, Validator
 from telebip.errors import UserError, nearest
 from telebip.files import is_file
 
 CONFIGS = ROOT / "configs"
-
-Leaf = tuple[str, Any, str]
-"""A field of a file or override: dotted key, value, and the place to name in errors, as "file:line"."""
 
 Schema = TypeVar("Schema")
 
@@ -33,39 +29,43 @@ def load_task(task: str | TaskConfig, overrides: Sequence[str] = ()) -> TaskConf
     return load(TaskConfig, task, overrides)
 
 
+def check(config: TaskConfig) -> TaskConfig:
+    """Return a task that was made or changed in code, validated, and with the default values of the terms' parameters.
+
+    Raises:
+        UserError: it names the field, as `load_task` does.
+    """
+    return load(TaskConfig, config)
+
+
 def load(schema: type[Schema], source: str | Schema, overrides: Sequence[str] = ()) -> Schema:
-    """Do what `load_task` does for any dataclass of `quantity` and `section` fields; names are those of files in `configs/`."""
-    origins: dict[str, str] = {}
+    """Do what `load_task` does for any dataclass of annotated fields; names are those of files in `configs/`."""
     if isinstance(source, str):
-        config, name = OmegaConf.structured(schema), source
-        for leaves in _layers(source):
-            _apply(config, leaves, origins)
+        tree, name = _read_task(source), source
     else:
-        config, name = OmegaConf.structured(source), "configuration"
+        tree, name = entry_of(plain(source), "configuration").value, "configuration"
     for override in overrides:
-        key, equals, value = override.partition("=")
-        where = f"override '{override}'"
-        if not equals or not re.fullmatch(r"\w+(\.\w+)*", key):
-            raise UserError(f"{where} is not of the form key.path=value")
-        _, parsed = _load_yaml(value, where)
-        _apply(config, [_with_robot_found((key, parsed, where), Path())], origins)
-    return _validate(config, origins, name)
+        key, layer = _read_override(override)
+        tree = merge(tree, layer, _is_group if key.count(".") < 2 else lambda _: False)  # a deeper key changes a group
+    return Validator().section(schema, Entry(tree, name))
 
 
-def parse_config(text: str, source: str) -> TaskConfig:
+def parse_config(text: str, source: str, missing: list[str] | None = None) -> TaskConfig:
     """Rebuild a configuration from `to_yaml`'s text, as checkpoints and run folders hold it; `source` names it in errors.
 
-    Fields that are younger than the text have the values of `telebip_flat`, which enters each with one that changes nothing.
+    Fields that are younger than the text have the values of `telebip_flat`, which enters each with one that changes nothing;
+    terms and names are the text's own. Terms whose function is not known here are errors, or `missing` takes their dotted
+    names and they are left out; those of `observations.policy` are always errors.
     """
-    config, origins = OmegaConf.structured(TaskConfig), {}
-    for leaves in (*_layers("telebip_flat"), _parse_yaml(text, source)):
-        _apply(config, leaves, origins)
-    return _validate(config, origins, source)
+    sections = {f.name for f in dataclasses.fields(TaskConfig) if dataclasses.is_dataclass(f.type)}
+    base = {name: entry for name, entry in _read_task("telebip_flat").items() if name not in {"observations", *KINDS}}
+    tree = merge(base, _section(read(text, source), source), lambda key: key not in sections)
+    return Validator(missing).section(TaskConfig, Entry(tree, source))
 
 
-def to_yaml(config: TaskConfig) -> str:
+def to_yaml(config: Any) -> str:
     """Return the whole configuration as YAML text, complete without a base."""
-    return OmegaConf.to_yaml(OmegaConf.structured(config))
+    return yaml.dump(plain(config), Dumper=Dumper, sort_keys=False)
 
 
 def task_names() -> list[str]:
@@ -73,8 +73,8 @@ def task_names() -> list[str]:
     return sorted(path.stem for path in CONFIGS.glob("*.yaml"))
 
 
-def _layers(task: str, named_at: str = "", below: tuple[Path, ...] = ()) -> list[list[Leaf]]:
-    """Return the leaves of a task's file and, before them, of the bases it builds on."""
+def _read_task(task: str, named_at: str = "", below: tuple[Path, ...] = ()) -> Tree:
+    """Return a task's file, laid over the bases it builds on."""
     path = _task_path(task, named_at, *(file.parent for file in below[-1:]))
     if path in below:
         raise UserError(f"{named_at}base '{task}' leads back to itself")
@@ -82,25 +82,44 @@ def _layers(task: str, named_at: str = "", below: tuple[Path, ...] = ()) -> list
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"{named_at}{_shown(path)}: {error}") from error
+    tree = _section(read(text, _shown(path)), _shown(path))
     folders = [path.parent, Path()] if path.parent != CONFIGS else [path.parent]
-    leaves = [_with_robot_found(leaf, *folders) for leaf in _parse_yaml(text, _shown(path))]
-    for key, value, where in leaves:
-        if key == "base":
-            if not isinstance(value, str):
-                raise UserError(f"{where}: base must be the name of a task")
-            own = [leaf for leaf in leaves if leaf[0] != "base"]
-            return [*_layers(value, f"{where}: ", (*below, path)), own]
-    return [leaves]
+    tree = _with_robot_found(tree, *folders)
+    base = tree.pop("base", None)
+    if base is None:
+        return tree
+    if not isinstance(base.value, str):
+        raise UserError(f"{base.where}: base must be the name of a task")
+    return merge(_read_task(base.value, f"{base.where}: ", (*below, path)), tree, _is_group)
 
 
-def _with_robot_found(leaf: Leaf, *folders: Path) -> Leaf:
+def _is_group(key: str) -> bool:
+    """Whether a dotted key names a group of observations: its order matters, so a task states it as a whole."""
+    return key.startswith("observations.") and key.count(".") == 1
+
+
+def _read_override(override: str) -> tuple[str, Tree]:
+    """Return an override's key, and a tree that holds nothing else."""
+    key, equals, value = override.partition("=")
+    where = f"override '{override}'"
+    if not equals or not re.fullmatch(r"\w+(\.\w+)*", key):
+        raise UserError(f"{where} is not of the form key.path=value")
+    entry = read(value, where, line_by_line=False)
+    for name in reversed(key.split(".")):
+        entry = Entry({name: entry}, where)
+    return key, _with_robot_found(entry.value, Path())
+
+
+def _with_robot_found(tree: Tree, *folders: Path) -> Tree:
     """Make the path of a robot of one's own absolute, so that it is found again from any working directory."""
-    key, value, where = leaf
-    if key == "sim.robot" and isinstance(value, str):
-        for file in (folder / value for folder in folders):
-            if is_file(file) and file.resolve() != (ROOT / value).resolve():
-                return key, str(file.resolve()), where
-    return leaf
+    sim = tree.get("sim")
+    robot = sim.value.get("robot") if sim and sim.is_section else None
+    if sim and robot and isinstance(robot.value, str):
+        for file in (folder / robot.value for folder in folders):
+            if is_file(file) and file.resolve() != (ROOT / robot.value).resolve():
+                found = Entry(str(file.resolve()), robot.where)
+                return {**tree, "sim": Entry({**sim.value, "robot": found}, sim.where)}
+    return tree
 
 
 def _task_path(task: str, named_at: str, *folders: Path) -> Path:
@@ -114,131 +133,11 @@ def _task_path(task: str, named_at: str, *folders: Path) -> Path:
     raise UserError(f"{named_at}unknown task '{task}'; {nearest(task, task_names())}")
 
 
-def _parse_yaml(text: str, source: str) -> list[Leaf]:
-    """Return the leaves of a YAML mapping."""
-    tree, values = _load_yaml(text, source)
-    if values is None:
-        return []
-    if not isinstance(tree, yaml.MappingNode):
+def _section(entry: Entry, source: str) -> Tree:
+    """Return the entries of a file."""
+    if entry.value is not None and not entry.is_section:
         raise UserError(f"{source}: a task is a mapping of fields to values")
-    try:
-        return list(_leaves(tree, values, source))
-    except RecursionError as error:  # an alias inside of what it stands for
-        raise UserError(f"{source}: a section contains itself") from error
-
-
-def _load_yaml(text: str, source: str) -> tuple[Any, Any]:
-    """Return YAML text as nodes, which know their lines, and as values."""
-    try:
-        return yaml.compose(text, Loader=yaml.SafeLoader), yaml.safe_load(text)
-    except Exception as error:  # PyYAML lets more than YAMLError escape, as from `!!int x`
-        raise UserError(f"{source}: not valid YAML: {error}") from error
-
-
-def _leaves(node: Any, values: Any, source: str, prefix: str = "") -> Iterator[Leaf]:
-    names = set()
-    for key_node, value_node in node.value:
-        key, where = str(key_node.value), f"{source}:{key_node.start_mark.line + 1}"
-        if key in names:
-            raise UserError(f"{where}: field '{prefix}{key}' stands there twice")
-        names.add(key)
-        value = values.get(key) if isinstance(values, dict) else None
-        if isinstance(value, dict) and value and isinstance(value_node, yaml.MappingNode):
-            yield from _leaves(value_node, value, source, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value, where
-
-
-def _apply(config: DictConfig, leaves: list[Leaf], origins: dict[str, str]) -> None:
-    """Set the leaves one by one, so that an error knows its place; remember where each came from."""
-    for key, value, where in leaves:
-        schema = _schema_of(OmegaConf.get_type(config), key, where)
-        if dataclasses.is_dataclass(schema):
-            names = ", ".join(f.name for f in dataclasses.fields(schema))
-            raise UserError(f"{where}: {key} is a section; set one of its fields: {names}")
-        try:
-            if "${" in str(value):
-                raise ValueError("OmegaConf would look the value up elsewhere")
-            OmegaConf.update(config, key, value, merge=False)
-        except (OmegaConfBaseException, OverflowError, ValueError, TypeError) as error:
-            raise UserError(f"{where}: {key}: {_describe(value)} is not {_type_name(schema)}") from error
-        origins[key] = where
-
-
-def _schema_of(schema: Any, key: str, where: str) -> Any:
-    """Return the type of a dotted key, or raise the error that names the nearest valid one."""
-    walked = ""
-    for name in key.split("."):
-        if schema == dict[str, float]:  # names of the user's own
-            schema, walked = float, f"{walked}{name}."
-            continue
-        fields = {f.name: f for f in dataclasses.fields(schema)} if dataclasses.is_dataclass(schema) else {}
-        if name not in fields:
-            raise UserError(
-                f"{where}: unknown field '{key}'; "
-                + (nearest(walked + name, [walked + f for f in fields]) if fields else f"'{walked[:-1]}' is a value")
-            )
-        schema, walked = fields[name].type, f"{walked}{name}."
-    return schema
-
-
-def _type_name(schema: Any) -> str:
-    names = {float: "a number", int: "a whole number", bool: "true or false", str: "a text"}
-    if schema in names:
-        return names[schema]
-    if schema == dict[str, float]:
-        return "a mapping of names to numbers"
-    text = str(schema)
-    if "Literal" in text:
-        return "one of " + ", ".join(schema.__args__)
-    return "a pair [low, high] of numbers" if "tuple" in text else "a list of whole numbers"
-
-
-def _describe(value: Any) -> str:
-    text = repr(value) if isinstance(value, str) else str(value)
-    return text if len(text) <= 40 else text[:37] + "..."
-
-
-def _validate(config: DictConfig, origins: dict[str, str], source: str) -> Any:
-    missing = OmegaConf.missing_keys(config)
-    if missing:
-        raise UserError(f"{source}: field '{min(missing)}' has no value")
-    values = OmegaConf.to_object(config)
-    for key, value, meta in _values(values):
-        where = origins.get(key, source)
-        for entry in value if isinstance(value, tuple | list) else [value]:
-            if isinstance(entry, float) and not math.isfinite(entry):
-                raise UserError(f"{where}: {key} must be finite, got {entry}")
-            for bound, limit in meta.get("bounds", {}).items():
-                sign, holds = _BOUNDS[bound]
-                if not holds(entry, limit):
-                    raise UserError(
-                        f"{where}: {key} must be {sign} {limit}{' ' + meta['unit'] if meta['unit'] else ''}, got {entry}"
-                    )
-        if isinstance(value, tuple) and value[0] > value[1]:
-            raise UserError(f"{where}: {key} must be [low, high], got [{value[0]}, {value[1]}]")
-        if value == []:
-            raise UserError(f"{where}: {key} must not be empty")
-    return values
-
-
-_BOUNDS = {
-    "gt": (">", lambda value, limit: value > limit),
-    "ge": (">=", lambda value, limit: value >= limit),
-    "lt": ("<", lambda value, limit: value < limit),
-    "le": ("<=", lambda value, limit: value <= limit),
-}
-
-
-def _values(node: Any, prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Yield (dotted key, value, metadata) of every leaf of a dataclass."""
-    for f in dataclasses.fields(node):
-        value = getattr(node, f.name)
-        if dataclasses.is_dataclass(value):
-            yield from _values(value, f"{prefix}{f.name}.")
-        else:
-            entries = value if isinstance(value, dict) else {"": value}
-            yield from ((f"{prefix}{f.name}.{name}".rstrip("."), entry, f.metadata) for name, entry in entries.items())
+    return entry.value or {}
 
 
 def _shown(path: Path) -> str:

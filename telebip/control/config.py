@@ -2,43 +2,45 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
-from telebip.config import load, quantity, section
+from telebip.config import load
+from telebip.mdp.term import Quantity
 
 
-@dataclass
+@dataclass(frozen=True)
 class WalkerConfig:
     """Read `configs/control/walker.yaml` for values and explanations."""
 
-    step_time: float = quantity("s", gt=0)
-    start_phase: float = quantity(ge=0, lt=1)
-    step_width: float = quantity("m", gt=0)
-    error_kept: float = quantity(ge=0, lt=1)
-    hip_height: float = quantity("m", gt=0)
-    heading_filter: float = quantity("s", gt=0)
-    acceleration: float = quantity("m/s^2", gt=0)
-    speed_gain: float = quantity("per step", ge=0, le=1)
-    speed_limit: float = quantity("m/s", ge=0)
-    steering_gain: float = quantity("m/rad", ge=0)
-    steering_limit: float = quantity("m", ge=0)
-    reach: float = quantity("m", gt=0)
-    feet_distance: tuple[float, float] = quantity("m", gt=0)
-    swing_height: float = quantity("m", ge=0)
-    swing_press: float = quantity("m", ge=0)
-    swing_arrival: float = quantity(gt=0, le=1)
-    height_stiffness: float = quantity("N/m", ge=0)
-    height_damping: float = quantity("N s/m", ge=0)
-    force_range: tuple[float, float] = quantity("body weights", ge=0)
-    trunk_stiffness: float = quantity("N m/rad", ge=0)
-    trunk_damping: float = quantity("N m s/rad", ge=0)
-    friction_use: float = quantity(ge=0, le=1)
+    step_time: Annotated[float, Quantity("s", gt=0)]
+    start_phase: Annotated[float, Quantity(ge=0, lt=1)]
+    step_width: Annotated[float, Quantity("m", gt=0)]
+    error_kept: Annotated[float, Quantity(ge=0, lt=1)]
+    hip_height: Annotated[float, Quantity("m", gt=0)]
+    heading_filter: Annotated[float, Quantity("s", gt=0)]
+    acceleration: Annotated[float, Quantity("m/s^2", gt=0)]
+    speed_gain: Annotated[float, Quantity("per step", ge=0, le=1)]
+    speed_limit: Annotated[float, Quantity("m/s", ge=0)]
+    steering_gain: Annotated[float, Quantity("m/rad", ge=0)]
+    steering_limit: Annotated[float, Quantity("m", ge=0)]
+    reach: Annotated[float, Quantity("m", gt=0)]
+    feet_distance: Annotated[tuple[float, float], Quantity("m", gt=0)]
+    swing_height: Annotated[float, Quantity("m", ge=0)]
+    swing_press: Annotated[float, Quantity("m", ge=0)]
+    swing_arrival: Annotated[float, Quantity(gt=0, le=1)]
+    height_stiffness: Annotated[float, Quantity("N/m", ge=0)]
+    height_damping: Annotated[float, Quantity("N s/m", ge=0)]
+    force_range: Annotated[tuple[float, float], Quantity("body weights", ge=0)]
+    trunk_stiffness: Annotated[float, Quantity("N m/rad", ge=0)]
+    trunk_damping: Annotated[float, Quantity("N m s/rad", ge=0)]
+    friction_use: Annotated[float, Quantity(ge=0, le=1)]
 
 
-@dataclass
+@dataclass(frozen=True)
 class ControllerConfig:
     """A file of `configs/control/`."""
 
-    control: WalkerConfig = section(WalkerConfig)
+    control: WalkerConfig
 
 
 def load_controller(name: str, overrides: Sequence[str] = ()) -> WalkerConfig:

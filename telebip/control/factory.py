@@ -1,18 +1,29 @@
-"""From a controller's name to a policy that walks an environment's robots."""
+"""From a controller's name to a policy that walks an environment's robots, and to the observations that it needs."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
-import torch
-
+from telebip.config import TaskConfig
 from telebip.control import alip, dcm
 from telebip.control.config import load_controller
 from telebip.control.kinematics import Kinematics
-from telebip.control.walker import Walker
+from telebip.control.walker import ESTIMATE, Walker
 from telebip.env import TelebipEnv
 from telebip.errors import UserError, nearest
-from telebip.mdp.actions import action_scale
+from telebip.mdp.term import ObservationGroup
 
 PLACEMENTS = {"alip": alip.foot_placement, "dcm": dcm.foot_placement}
+
+
+def with_estimate(cfg: TaskConfig) -> TaskConfig:
+    """Return the task with the group of observations that the walkers read, `estimate`.
+
+    Each of its terms has the noise that the group `policy` has for it, and none where that group lacks it.
+    """
+    policy = cfg.observations["policy"]
+    noise = {params.get("term", name): params.get("noise", 0.0) for name, params in policy.terms.items()}
+    estimate = ObservationGroup({name: {"noise": noise.get(name, 0.0)} for name in ESTIMATE}, noise=policy.noise)
+    return replace(cfg, observations={**cfg.observations, "estimate": estimate})
 
 
 def make_controller(name: str, env: TelebipEnv, overrides: Sequence[str] = ()) -> Walker:
@@ -20,7 +31,7 @@ def make_controller(name: str, env: TelebipEnv, overrides: Sequence[str] = ()) -
 
     Args:
         name: one of `PLACEMENTS`, with its parameters in `configs/control/<name>.yaml`.
-        env: whose robot walks.
+        env: whose robot walks; of a task that `with_estimate` has returned.
         overrides: `control.key=value`, see `configs/control/walker.yaml`.
 
     Raises:
@@ -32,8 +43,8 @@ def make_controller(name: str, env: TelebipEnv, overrides: Sequence[str] = ()) -
         load_controller(name, overrides),
         PLACEMENTS[name],
         Kinematics(env.robot, env.device),
-        nominal=torch.as_tensor(env.robot.nominal, dtype=torch.float32, device=env.device),
-        action_scale=action_scale(env.cfg.action).to(env.device),
+        nominal=env.world.nominal,
+        action_scale=env.world.action_scale,
         num_envs=env.num_envs,
         step_dt=env.step_dt,
     )

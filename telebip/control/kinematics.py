@@ -20,7 +20,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from telebip.errors import UserError
-from telebip.robot import FEET, JOINTS, Robot
+from telebip.robot import FEET, Robot
+
+JOINTS = tuple(f"{side}_{joint}" for side in ("right", "left") for joint in ("hip_roll", "hip_pitch", "knee"))
+"""The joints of a robot that the walkers can use, in the order of its actuators."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +49,10 @@ class Kinematics:
         """Read masses, lengths and actuator gains from the model.
 
         Raises:
-            UserError: the legs are not built as the walkers expect.
+            UserError: the robot has other joints, or its legs are not built as the walkers expect.
         """
+        if robot.joint_names != JOINTS or robot.model.nv != 12:
+            raise UserError(f"{robot.path}: the model-based walkers need the joints {', '.join(JOINTS)} and no others")
 
         def constant(values) -> Tensor:
             return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=device)

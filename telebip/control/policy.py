@@ -9,16 +9,16 @@ from torch import Tensor
 
 
 class Policy(Protocol):
-    """Acts for all worlds at once, from what the robot observes (`telebip.mdp.observations.LAYOUT`) and nothing else.
+    """Acts for all worlds at once, from the groups of observations that it reads and nothing else.
 
     A policy may remember: `reset` makes it forget in the worlds that start anew. rsl-rl's `MLPModel` satisfies it as it is.
     """
 
     def __call__(self, obs: TensorDict) -> Tensor:
-        """Return actions (num_envs, 6), joint targets as `telebip.mdp.actions.joint_targets` reads them.
+        """Return actions (num_envs, num_joints), see `telebip.mdp.actions`.
 
         Args:
-            obs: {"policy": (num_envs, 33)}, as `TelebipEnv.step` returns it.
+            obs: one entry (num_envs, size) for each group of the task's `observations`, as `TelebipEnv.step` returns it.
         """
         ...
 

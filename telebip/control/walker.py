@@ -17,7 +17,12 @@ from telebip.control.kinematics import Kinematics, Motion, cross, joint_forces, 
 from telebip.control.legs import Hold, stance_force, swing_path
 from telebip.control.pendulum import Pendulum, Placement, Step
 from telebip.math import matrix, wrap_angle
-from telebip.mdp.observations import LAYOUT
+
+ESTIMATE = {
+    **{"joint_pos": 6, "joint_vel": 6, "last_action": 6, "base_lin_vel": 3, "base_ang_vel": 3, "base_quat": 4},
+    **{"command": 3, "phase": 2},
+}
+"""Terms of the group of observations that a walker reads, in their order, with their sizes: the article's 33 numbers."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +90,7 @@ class Walker:
 
     def __call__(self, obs: TensorDict) -> Tensor:
         """See `Policy`."""
-        body = self._observe(obs["policy"].T)
+        body = self._observe(obs["estimate"].T)
         self._begin_steps(body)
         stance_foot, _ = self._stance_and_swing(body.foot)
         stance_pos, swing_pos = self._stance_and_swing(body.joint_pos)
@@ -108,7 +113,7 @@ class Walker:
 
     def _observe(self, obs: Tensor) -> Body:
         """Read observations (33, num_envs), and bring the plan frame's heading up to date."""
-        part = dict(zip(LAYOUT, obs.split(list(LAYOUT.values())), strict=True))
+        part = dict(zip(ESTIMATE, obs.split(list(ESTIMATE.values())), strict=True))
         frame = matrix(part["base_quat"].T).permute(1, 2, 0).contiguous()
         heading = torch.atan2(frame[1, 0], frame[0, 0])
         change = (self.step_dt / self.cfg.heading_filter) * wrap_angle(heading - self._heading)

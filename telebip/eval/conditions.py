@@ -1,18 +1,31 @@
 """Under which conditions a policy is measured and shown."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from telebip.config import TaskConfig, load_task
+from telebip.mdp.term import find
 
 
 def as_evaluated(
-    config: TaskConfig, num_envs: int | str, duration: float, overrides: Sequence[str] = (), disturbed: bool = False
+    config: TaskConfig, num_envs: int, duration: float, overrides: Sequence[str] = (), disturbed: bool = False
 ) -> TaskConfig:
     """Return a task whose robots start facing x and walk `duration` s without a time-out.
 
-    `disturbed` ones keep the task's disturbances; else there are no pushes and no observation noise, and the ground has the
-    friction of the MJCF. Extra reward terms are left out: walking needs no rewards, and their functions need not be there.
+    `disturbed` ones keep the task's disturbances; else there is no observation noise, and no event that is a disturbance, such
+    as pushes and random friction, but those that `overrides` name. The group of observations `critic` is left out.
     """
-    switches = [] if disturbed else [f"disturbance.{name}.enabled=false" for name in ("push", "friction", "noise")]
-    start = [f"num_envs={num_envs}", f"episode.length={duration + 1.0}", "episode.reset_heading=0"]
-    return load_task(config, [*start, *switches, "reward.extra={}", *overrides])
+    load_task(config, overrides)  # so that a mistake in them is told beside the whole task's names
+    named = {override.partition("=")[0].split(".")[1] for override in overrides if override.startswith("events.")}
+    events = {}
+    for name, params in config.events.items():
+        event = find("event", params.get("term", name))
+        if disturbed or name in named or not event.is_disturbance:
+            events[name] = {**params, "heading": 0.0} if event.name == "start_pose" else params
+    groups = {
+        name: group if disturbed else replace(group, noise=False)
+        for name, group in config.observations.items()
+        if name != "critic"
+    }
+    episode = replace(config.episode, length=duration + 1.0)
+    return load_task(replace(config, num_envs=num_envs, episode=episode, events=events, observations=groups), overrides)

@@ -30,7 +30,7 @@ class GaitSummary:
     flight: float  # share of the time that neither is [-]
     peak_force_bw: float  # mean over strides of a foot's largest force [body weights]
     stride_length_m: float  # mean speed x period
-    knee_stroke_m: float  # mean over strides of the travel that a prismatic knee uses
+    knee_stroke_m: float  # mean over strides of the travel that a prismatic knee uses; NaN without one
 
 
 def summarise_gait(
@@ -40,7 +40,7 @@ def summarise_gait(
 
     Args:
         foot_force: normal forces on the right and the left foot [N], (steps, num_envs, 2).
-        knee_pos: positions of the two knees [m], (steps, num_envs, 2).
+        knee_pos: positions of the prismatic knees [m], (steps, num_envs, knees); there may be none.
         speed: mean forward speed [m/s].
         weight: m g [N].
         step_dt: time between rows [s].
@@ -59,7 +59,7 @@ def summarise_gait(
         flight=float((~down).all(-1).mean()),
         peak_force_bw=float(_strides(foot_force, steps).max(1).mean()) / weight,
         stride_length_m=abs(speed) * stride,
-        knee_stroke_m=float(np.ptp(_strides(knee_pos, steps), axis=1).mean()),
+        knee_stroke_m=float(np.ptp(_strides(knee_pos, steps), axis=1).mean()) if knee_pos.size else float("nan"),
     )
 
 

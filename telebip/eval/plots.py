@@ -144,11 +144,13 @@ def joints(results: Results) -> Figure:
         figure, axes = plt.subplots(figsize=(7.2, 0.7 + 0.42 * len(rows)))
         names = list(rows[0]["cot_joints"])
         left = np.zeros(len(rows))
-        for i, name in enumerate(names):
-            share = np.array([row["cot_joints"][name] or 0.0 for row in rows])
-            side = 1.0 if name.startswith("right") else 0.55
-            axes.barh(range(len(rows)), share, left=left, color=COLORS[i % 3], alpha=side, label=name.replace("_", " "))
-            left += share
+        kinds = list(dict.fromkeys(name.removeprefix("right_").removeprefix("left_") for name in names))
+        for name in names:
+            cost = np.array([row["cot_joints"][name] or 0.0 for row in rows])
+            tone = COLORS[kinds.index(name.removeprefix("right_").removeprefix("left_")) % len(COLORS)]
+            alpha = 0.55 if name.startswith("left_") else 1.0
+            axes.barh(range(len(rows)), cost, left=left, color=tone, alpha=alpha, label=name.replace("_", " "))
+            left += cost
         axes.set_yticks(range(len(rows)), [f"{row['command_mps']:g} m/s" for row in rows])
         axes.invert_yaxis()
         axes.grid(axis="y", visible=False)
@@ -177,13 +179,13 @@ def learning(all_results: Sequence[Results]) -> Figure:
 
 
 def throughput(rows: Sequence[dict[str, Any]], title: str) -> Figure:
-    """Environment steps per second against the number of worlds, as `telebip.rl.benchmark.measure` returns them."""
-    rungs = {"engine": "physics engine alone", "env": "environment", "collect": "with the policy", "train": "training"}
+    """Environment steps per second against the number of worlds, as `telebip.tools.benchmark.measure` returns them."""
+    stages = {"engine": "physics engine alone", "env": "environment", "collect": "with the policy", "train": "training"}
     worlds = [row["num_envs"] for row in rows]
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(figsize=(7.2, 3.4))
-        for i, (rung, label) in enumerate(rungs.items()):
-            rates = [row[f"{rung}_env_steps_per_s"] for row in rows]
+        for i, (stage, label) in enumerate(stages.items()):
+            rates = [row[f"{stage}_env_steps_per_s"] for row in rows]
             axes.plot(worlds, rates, "o-", color=COLORS[i], lw=1.4, ms=4, label=label)
         axes.set_xscale("log", base=2)
         axes.set_xticks(worlds, [str(number) for number in worlds])
@@ -195,7 +197,7 @@ def throughput(rows: Sequence[dict[str, Any]], title: str) -> Figure:
 
 
 def race(races: Sequence[dict[str, Any]], title: str) -> Figure:
-    """Return of the episodes against samples and against time, one line a seed, of `telebip.rl.race.race`."""
+    """Return of the episodes against samples and against time, one line a seed, of `telebip.tools.race.race`."""
     with plt.rc_context(STYLE):
         figure, (left, right) = plt.subplots(1, 2, figsize=(9.2, 2.8), sharey=True)
         for i, (name, label) in enumerate({"telebip": "telebip", "stock": "rsl-rl's PPO in float32"}.items()):

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from telebip.control.policy import Policy
 from telebip.env import TelebipEnv
-from telebip.eval.rollout import judge_faults
-from telebip.mdp.randomization import uniform
+from telebip.rollout import judge_faults, walk
 
 DIRECTIONS = {"forward": (1.0, 0.0), "backward": (-1.0, 0.0), "left": (0.0, 1.0), "right": (0.0, -1.0)}
 """Unit vectors in the plane, x forward and y left of a robot that faces x."""
@@ -105,21 +104,18 @@ def push_trial(
     shape = (len(protocol.forces), len(DIRECTIONS), protocol.worlds)
     force = torch.as_tensor(protocol.forces, dtype=torch.float32, device=env.device)[:, None, None, None]
     direction = torch.tensor(list(DIRECTIONS.values()), device=env.device)[None, :, None]
-    push = (force * direction).expand(*shape, 2).reshape(-1, 2)
-    first = protocol.warmup + uniform((env.num_envs,), 0.0, protocol.interval, env.generator)
+    push = torch.nn.functional.pad((force * direction).expand(*shape, 2).reshape(-1, 2), (0, 1))  # (num_envs, 3)
+    first = protocol.warmup + protocol.interval * torch.rand(env.num_envs, generator=env.generator, device=env.device)
     survival = torch.full((env.num_envs,), torch.inf, device=env.device)
     env.set_command(protocol.command, 0.0, 0.0)
-    with torch.inference_mode():
-        policy.reset(torch.ones(env.num_envs, dtype=torch.bool, device=env.device))
-        obs = env.get_observations()
-        for step in range(round(protocol.seconds / env.step_dt)):
-            since = step * env.step_dt - first
-            pushing = (since > -1e-6) & (torch.remainder(since + 1e-6, protocol.interval) < protocol.duration)
-            env.push_wrench_w[:, :2] = push * pushing[:, None]
-            obs, _, dones, _ = env.step(policy(obs))
-            policy.reset(dones)
-            walked = max(0.0, (step + 1) * env.step_dt - protocol.warmup)
-            survival = torch.where(dones & survival.isinf(), walked, survival)
-            progress(step + 1)
+    walking = walk(env, policy)
+    for step in range(round(protocol.seconds / env.step_dt)):
+        since = step * env.step_dt - first
+        pushing = (since > -1e-6) & (torch.remainder(since + 1e-6, protocol.interval) < protocol.duration)
+        env.push(push * pushing[:, None])
+        dones = next(walking).dones
+        walked = max(0.0, (step + 1) * env.step_dt - protocol.warmup)
+        survival = torch.where(dones & survival.isinf(), walked, survival)
+        progress(step + 1)
     judge_faults(env)
     return survival.reshape(shape).cpu().numpy()

@@ -36,7 +36,7 @@ def write_report(
         markdown.append(f"![{name.replace('_', ' ')}]({name}.svg)")
         page.append(f"<figure>{picture}</figure>")
     markdown += [f"## {heading}\n\n{_markdown(header, rows)}" for heading, header, rows in tables]
-    page += [f"<figure>{plots.svg(figure())}</figure>" for figure in _portraits(all_results)]
+    page += [f"<figure>{plots.svg(figure())}</figure>" for figure in _figures_of_each(all_results)]
     page += [f"<h2>{html.escape(heading)}</h2>{_html(header, rows)}" for heading, header, rows in tables]
     write(out / "report.md", "\n\n".join(markdown) + "\n")
     write(out / "report.html", _PAGE.format(title=html.escape(title), body="\n".join(page)))
@@ -66,7 +66,7 @@ def can_be_shown(results: Results) -> bool:
     """Whether results hold all that tables and pictures show of them, which older and damaged ones may not."""
     try:
         _tables([results])
-        for figure in (*(figure for _, figure in _comparisons([results], [])), *_portraits([results])):
+        for figure in (*(figure for _, figure in _comparisons([results], [])), *_figures_of_each([results])):
             plots.close(figure())
     except (AttributeError, IndexError, KeyError, TypeError, ValueError):
         return False
@@ -113,7 +113,7 @@ def _comparisons(all_results: Sequence[Results], references: Sequence[Results]) 
     return figures
 
 
-def _portraits(all_results: Sequence[Results]) -> list[Callable[[], Any]]:
+def _figures_of_each(all_results: Sequence[Results]) -> list[Callable[[], Any]]:
     """Return the pictures of each walker alone."""
     figures: list[Callable[[], Any]] = []
     for results in all_results:

@@ -34,7 +34,7 @@ TRAININGS = (
     Training("telebip_efficient", "RL, efficient", "telebip_efficient", suites=ALL),
     Training("telebip_robust", "RL, robust", "telebip_robust", suites=ALL),
     Training("telebip_flat", "RL, article's rewards", "telebip_flat", suites=ALL),
-    Training("no_foot_reward", "RL, no foot reward", "telebip_flat", ("reward.foot.k_foot=0", "ppo.max_iterations=100")),
+    Training("no_foot_reward", "RL, no foot reward", "telebip_flat", ("rewards.foot.k_foot=0", "ppo.max_iterations=100")),
     Training("period_06", "RL, period 0.6 s", "telebip_flat", ("gait.period=0.6", *SHORT)),
     Training("telebip_slow", "RL, slow", "telebip_slow", SHORT),
     Training("telebip_fast", "RL, fast", "telebip_fast", SHORT),

@@ -8,6 +8,7 @@ import platform
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,8 @@ import numpy as np
 import torch
 
 from telebip import __version__
-from telebip.config import TaskConfig
+from telebip.config import TaskConfig, load_task
+from telebip.control.factory import with_estimate
 from telebip.control.policy import Policy
 from telebip.env import TelebipEnv
 from telebip.errors import UserError, nearest
@@ -23,9 +25,9 @@ from telebip.eval.conditions import as_evaluated
 from telebip.eval.gait import summarise_gait
 from telebip.eval.learning import learning_curve
 from telebip.eval.push import PushProtocol, push_limits, push_trial
-from telebip.eval.rollout import Rollout, roll_out
 from telebip.eval.walk import heading_velocity, summarise
-from telebip.robot import JOINTS, Robot
+from telebip.robot import Robot
+from telebip.rollout import Rollout, roll_out
 from telebip.sim import Backend, choose_backend
 
 SUITES = ("tracking", "push", "gait", "learning")
@@ -37,17 +39,22 @@ Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
-class Subject:
+class Candidate:
     """What is evaluated. `make_policy` makes it anew for each environment that it is to walk in."""
 
     label: str
-    config: TaskConfig
+    config: TaskConfig  # without the `overrides`
     make_policy: Callable[[TelebipEnv], Policy]
-    limited: bool = True  # to the commands it was trained on; a model-based controller takes any
+    is_model_based: bool = False  # then it takes any command, and reads the group of observations "estimate"
     run_dir: Path | None = None  # where its learning curve is kept
     source: str = ""  # how to measure it again: a command
     fingerprint: str = ""  # of what decides how it walks: weights, parameters
     overrides: tuple[str, ...] = ()  # of the task, which hold in the evaluator's worlds too
+
+    @cached_property
+    def task(self) -> TaskConfig:
+        """The task with its overrides, as it is without the evaluator's conditions."""
+        return load_task(self.config, self.overrides)
 
 
 @dataclass(frozen=True)
@@ -76,94 +83,96 @@ def check_suites(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def evaluate(
-    subject: Subject,
+    candidate: Candidate,
     robot: Robot,
     suites: Sequence[str],
     protocol: Protocol,
     progress: Progress = lambda name, step, total: None,
 ) -> dict[str, Any]:
     """Run suites and return the results: plain numbers, texts, lists and dictionaries. Deterministic for the task's seed."""
-    curve = learning_curve(subject.run_dir) if "learning" in suites and subject.run_dir else None  # first: it may be damaged
+    run_dir = candidate.run_dir if "learning" in suites else None
+    curve = learning_curve(run_dir) if run_dir else None  # first: it may be damaged
     results: dict[str, Any] = {
         "schema": "telebip-results-1",
-        "label": subject.label,
-        "source": subject.source,
-        "fingerprint": subject.fingerprint,
+        "label": candidate.label,
+        "source": candidate.source,
+        "fingerprint": candidate.fingerprint,
         "telebip": __version__,
         "date": datetime.now().astimezone().isoformat(timespec="seconds"),
         "machine": f"{platform.machine()}, {protocol.device}",
         "engine": choose_backend(protocol.backend, protocol.device),
-        "protocol": describe_protocol(subject, protocol),
+        "protocol": describe_protocol(candidate, protocol),
     }
     if "tracking" in suites or "gait" in suites:
-        walks = _walk(subject, robot, protocol, progress)
+        walks = _walk(candidate, robot, protocol, progress)
         if "tracking" in suites:
             results["tracking"] = [_tracking_row(command, walk, protocol.skip) for command, walk in walks.items()]
         command = min(walks, key=lambda speed: abs(speed - protocol.push.command))
         results["series"] = {"speed": _speed_series(walks), "feet": _feet_series(walks[command], command)}
         if "gait" in suites:
-            results["gait"] = _gait(walks[command], command, protocol.skip, subject.config.gait.period)
+            results["gait"] = _gait(walks[command], robot, command, protocol.skip, candidate.task.gait.period)
     if "push" in suites:
-        results["push"] = _push(subject, robot, protocol, progress)
+        results["push"] = _push(candidate, robot, protocol, progress)
     if "learning" in suites:
         results["learning"] = curve
     return results
 
 
-def describe_protocol(subject: Subject, protocol: Protocol) -> dict[str, Any]:
+def describe_protocol(candidate: Candidate, protocol: Protocol) -> dict[str, Any]:
     """Return how the walking suites are run, as results say it."""
     return {
         "worlds": protocol.worlds,
         "duration_s": protocol.duration,
         "skip_s": protocol.skip,
-        "seed": subject.config.seed,
-        "gait_period_s": subject.config.gait.period,
+        "seed": candidate.task.seed,
+        "gait_period_s": candidate.task.gait.period,
     }
 
 
-def push_protocol_of(subject: Subject, protocol: Protocol) -> PushProtocol:
+def push_protocol_of(candidate: Candidate, protocol: Protocol) -> PushProtocol:
     """Return how the push suite is run: at a speed that the policy was trained on."""
-    low, high = subject.config.command.lin_vel_x
-    command = float(np.clip(protocol.push.command, low, high)) if subject.limited else protocol.push.command
+    low, high = candidate.task.commands.lin_vel_x
+    command = protocol.push.command if candidate.is_model_based else float(np.clip(protocol.push.command, low, high))
     return dataclasses.replace(protocol.push, command=command)
 
 
-def is_current(results: dict[str, Any], subject: Subject, suites: Sequence[str], protocol: Protocol) -> bool:
+def is_current(results: dict[str, Any], candidate: Candidate, suites: Sequence[str], protocol: Protocol) -> bool:
     """Whether results from a file are what `evaluate` would measure again: all of the suites, of the same, in the same way."""
-    push = push_protocol_of(subject, protocol)
+    push = push_protocol_of(candidate, protocol)
     pushed = {**asdict(push), "horizons": list(push.horizons)}
     return (
         set(suites) <= results.keys()
         and all(results[suite] for suite in suites if suite != "learning")  # which may be null
-        and results.get("fingerprint") == subject.fingerprint
-        and results.get("protocol") == describe_protocol(subject, protocol)
+        and results.get("fingerprint") == candidate.fingerprint
+        and results.get("protocol") == describe_protocol(candidate, protocol)
         and ("push" not in suites or results["push"].get("protocol") == pushed)
     )
 
 
-def commands_of(subject: Subject, protocol: Protocol) -> tuple[float, ...]:
+def commands_of(candidate: Candidate, protocol: Protocol) -> tuple[float, ...]:
     """Return the forward speeds to ask for [m/s]."""
     if protocol.commands is not None:
         return protocol.commands
-    low, high = subject.config.command.lin_vel_x
-    known = tuple(c for c in COMMANDS if not subject.limited or low <= c <= high)
+    low, high = candidate.task.commands.lin_vel_x
+    known = tuple(c for c in COMMANDS if candidate.is_model_based or low <= c <= high)
     return known or (round(0.5 * (low + high), 3),)
 
 
-def make_env(subject: Subject, robot: Robot, protocol: Protocol, num_envs: int, duration: float) -> TelebipEnv:
-    """Create worlds of the subject's task, undisturbed unless its overrides say otherwise."""
-    config = as_evaluated(subject.config, num_envs, duration, subject.overrides)
+def make_env(candidate: Candidate, robot: Robot, protocol: Protocol, num_envs: int, duration: float) -> TelebipEnv:
+    """Create worlds of the candidate's task, undisturbed unless its overrides say otherwise; see `as_evaluated`."""
+    config = as_evaluated(candidate.config, num_envs, duration, candidate.overrides)
+    config = with_estimate(config) if candidate.is_model_based else config
     return TelebipEnv(config, robot, protocol.device, protocol.backend)
 
 
-def _walk(subject: Subject, robot: Robot, protocol: Protocol, progress: Progress) -> dict[float, Rollout]:
+def _walk(candidate: Candidate, robot: Robot, protocol: Protocol, progress: Progress) -> dict[float, Rollout]:
     """Walk all commands as one batch, and return each command's worlds."""
-    commands = commands_of(subject, protocol)
-    env = make_env(subject, robot, protocol, len(commands) * protocol.worlds, protocol.duration)
+    commands = commands_of(candidate, protocol)
+    env = make_env(candidate, robot, protocol, len(commands) * protocol.worlds, protocol.duration)
     forward = torch.tensor(commands, device=env.device).repeat_interleave(protocol.worlds)
     env.set_commands(torch.nn.functional.pad(forward[:, None], (0, 2)))
     steps = max(1, round(protocol.duration / env.step_dt))
-    rollout = roll_out(env, subject.make_policy(env), steps, lambda step: progress("walking", step, steps))
+    rollout = roll_out(env, candidate.make_policy(env), steps, lambda step: progress("walking", step, steps))
     n = protocol.worlds
     return {command: rollout.select(slice(i * n, (i + 1) * n)) for i, command in enumerate(commands)}
 
@@ -181,24 +190,24 @@ def _tracking_row(command: float, rollout: Rollout, skip: float) -> dict[str, An
         "cot_mechanical": round(s.cost_of_transport, 5),
         "cot_article": round(s.cost_of_transport_article, 5),
         "cot_positive": round(s.cost_of_transport_positive, 5),
-        "cot_joints": {name: round(cost, 5) for name, cost in zip(JOINTS, s.joint_cost_of_transport, strict=True)},
+        "cot_joints": {name: round(cost, 5) for name, cost in zip(rollout.joint_names, s.joint_cost_of_transport, strict=True)},
     }
 
 
-def _gait(rollout: Rollout, command: float, skip: float, clock: float) -> dict[str, float]:
+def _gait(rollout: Rollout, robot: Robot, command: float, skip: float, clock: float) -> dict[str, float]:
     kept = rollout.after(skip)
     speed = float(heading_velocity(kept.qpos, kept.qvel)[..., 0].mean(dtype=float))
-    knees = kept.qpos[..., 7:][..., [2, 5]]
-    summary = summarise_gait(kept.foot_force, knees, speed, rollout.weight, rollout.step_dt, clock)
+    knees = [i for i, name in enumerate(robot.joint_names) if name.endswith("knee") and robot.is_slide[i]]
+    summary = summarise_gait(kept.foot_force, kept.joint_pos[..., knees], speed, rollout.weight, rollout.step_dt, clock)
     return {"command_mps": command, **{name: round(value, 5) for name, value in asdict(summary).items()}}
 
 
-def _push(subject: Subject, robot: Robot, protocol: Protocol, progress: Progress) -> dict[str, Any]:
-    push = push_protocol_of(subject, protocol)
-    env = make_env(subject, robot, protocol, push.num_envs, push.seconds)
+def _push(candidate: Candidate, robot: Robot, protocol: Protocol, progress: Progress) -> dict[str, Any]:
+    push = push_protocol_of(candidate, protocol)
+    env = make_env(candidate, robot, protocol, push.num_envs, push.seconds)
     total = round(push.seconds / env.step_dt)
     name = f"pushing {push.num_envs} worlds"
-    survival = push_trial(env, subject.make_policy(env), push, lambda step: progress(name, step, total))
+    survival = push_trial(env, candidate.make_policy(env), push, lambda step: progress(name, step, total))
     return {"protocol": asdict(push), **push_limits(survival, push, robot.weight)}
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telebip.eval.gait import rhythm
-from telebip.eval.rollout import Rollout
+from telebip.rollout import Rollout
 
 Array = NDArray[np.floating]
 
@@ -30,7 +30,7 @@ class WalkSummary:
     cost_of_transport: float  # of |power|, see `cost_of_transport`
     cost_of_transport_article: float  # the article's formula, see there
     cost_of_transport_positive: float  # of positive power alone: braking costs nothing and gives nothing back
-    joint_cost_of_transport: tuple[float, ...]  # of |power|, each actuator's share, in the order of `robot.JOINTS`
+    joint_cost_of_transport: tuple[float, ...]  # of |power|, each actuator's share, in the order of `Rollout.joint_names`
     gait_period: float  # see `telebip.eval.gait.rhythm` [s]
     falls: int
     worlds_fallen: int  # of which there are at most `worlds`
@@ -46,7 +46,8 @@ def summarise(rollout: Rollout, skip: float) -> WalkSummary:
     drift = _wrap(_yaw(rollout.qpos[-1, :, 3:7]) - rollout.reference_heading[-1])
     speeds = velocity[..., 0].mean(0, dtype=float)
     worlds = len(speeds)
-    joints = tuple(cost_of_transport(kept.joint_power[..., i], velocity, rollout.weight) for i in range(6))
+    powers = np.moveaxis(kept.joint_power, -1, 0)
+    joints = tuple(cost_of_transport(power, velocity, rollout.weight) for power in powers)
     return WalkSummary(
         worlds=worlds,
         duration=float(rollout.time[-1]),

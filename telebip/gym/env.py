@@ -2,6 +2,7 @@
 """`TelebipEnv` as Gymnasium environments: numpy in, numpy out. On a GPU, `TelebipEnv` itself spares the copies."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import gymnasium
@@ -15,35 +16,24 @@ from torch import Tensor
 
 from telebip.config import TaskConfig, load_task
 from telebip.env import TelebipEnv
-from telebip.mdp.observations import LAYOUT
-from telebip.robot import JOINTS, Robot, load_robot
+from telebip.mdp.groups import Group
+from telebip.robot import Robot, load_robot
 from telebip.sim import Backend
 
 Array = NDArray[np.float32]
-
-AXES = {
-    "base_lin_vel": ("x", "y", "z"),
-    "base_ang_vel": ("x", "y", "z"),
-    "base_quat": ("w", "x", "y", "z"),
-    "command": ("lin_vel_x", "lin_vel_y", "ang_vel_z"),
-    "phase": ("right", "left"),
-}
-ACTION_NAMES = JOINTS
-OBSERVATION_NAMES = tuple(f"{part}/{axis}" for part in LAYOUT for axis in AXES.get(part, JOINTS))
 
 
 class TelebipVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
     """`num_envs` worlds that reset in the step that ends their episode (`AutoresetMode.SAME_STEP`).
 
-    Where an episode ended, `infos["final_obs"]` has its last observation, and `infos["_final_obs"]` is true. A fall terminates,
-    a time-out truncates. Names of the numbers: `metadata["observation_names"]` and `metadata["action_names"]`.
+    The task's group of observations `policy` is what they return. Where an episode ended, `infos["final_obs"]` has its last
+    observation, and `infos["_final_obs"]` is true. A fall terminates, a time-out truncates. Names of the numbers:
+    `metadata["observation_names"]` and `metadata["action_names"]`.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 (Gymnasium's own declaration)
         "autoreset_mode": AutoresetMode.SAME_STEP,
         "render_modes": [],
-        "observation_names": OBSERVATION_NAMES,
-        "action_names": ACTION_NAMES,
     }
 
     def __init__(
@@ -66,12 +56,18 @@ class TelebipVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
         Raises:
             UserError: something is wrong with the task.
         """
-        cfg = load_task(task, [f"num_envs={num_envs}", *overrides])
+        cfg = load_task(replace(load_task(task), num_envs=num_envs), overrides)
+        cfg = replace(cfg, observations={"policy": cfg.observations["policy"]})
         self.worlds = TelebipEnv(cfg, load_robot(cfg.sim.robot), device, backend, keep_final_obs=True)
-        self.num_envs = cfg.num_envs
-        self.metadata = {**self.metadata, "render_fps": round(1.0 / self.worlds.step_dt)}
-        self.single_action_space = action_space(cfg, self.worlds.robot)
-        self.single_observation_space = observation_space(cfg, self.single_action_space)
+        self.num_envs, seen = cfg.num_envs, self.worlds.groups["policy"]
+        self.metadata = {
+            **self.metadata,
+            "render_fps": round(1.0 / self.worlds.step_dt),
+            "observation_names": observation_names(seen),
+            "action_names": self.worlds.robot.joint_names,
+        }
+        self.single_action_space = action_space(self.worlds.robot, self.worlds.world.action_scale.cpu().numpy())
+        self.single_observation_space = observation_space(cfg, seen, self.single_action_space)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
 
@@ -83,7 +79,7 @@ class TelebipVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
         return _numpy(self.worlds.reset()["policy"]), {}
 
     def step(self, actions: Array) -> tuple[Array, Array, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        """Hold the joint targets of `actions` (num_envs, 6), clipped to the action space, for one policy step."""
+        """Hold the joint targets of `actions` (num_envs, num_joints), clipped to the action space, for one policy step."""
         low, high = self.single_action_space.low, self.single_action_space.high
         clipped = torch.as_tensor(np.clip(actions, low, high), dtype=torch.float32, device=self.worlds.device)
         with torch.inference_mode():
@@ -115,42 +111,51 @@ class TelebipSingleEnv(gymnasium.Env[Array, Array]):
         return obs[0], info
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """Hold the joint targets of `action` (6,) for one policy step."""
+        """Hold the joint targets of `action` (num_joints,) for one policy step."""
         obs, rewards, terminated, truncated, infos = self._vector.step(action[None])
         last = infos["final_obs"][0] if infos else obs[0]
         return last, float(rewards[0]), bool(terminated[0]), bool(truncated[0]), {}
 
 
-def action_space(cfg: TaskConfig, robot: Robot) -> Box:
+def action_space(robot: Robot, scale: NDArray[np.floating]) -> Box:
     """Return the bounds of an action [-]: joint targets as far outside of the joint's range as saturates its actuator.
 
-    From there on a larger action changes nothing for a joint at rest, wherever in its range it stands.
+    From there on a larger action changes nothing for a joint at rest, wherever in its range it stands. `scale` is the
+    displacement of each joint's target per unit of action [rad | m], (num_joints,).
     """
-    scale = np.array([cfg.action.hip_roll, cfg.action.hip_pitch, cfg.action.knee] * 2)
     beyond = robot.force_limit / robot.model.actuator_gainprm[:, 0]
     low = (robot.joint_range[:, 0] - beyond - robot.nominal) / scale
     high = (robot.joint_range[:, 1] + beyond - robot.nominal) / scale
     return Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
 
 
-def observation_space(cfg: TaskConfig, actions: Box) -> Box:
-    """Return the bounds of an observation, in the order of `telebip.mdp.observations.LAYOUT`; what has none is unbounded."""
-    command, noise = cfg.command, cfg.disturbance.noise
+def observation_names(group: Group) -> tuple[str, ...]:
+    """Return the name of each number: `joint_pos/right_knee`, and `joint_pos/right_knee@-1` for one of a policy step before."""
+    frame = [f"{part.name}/{axis}" for part in group.parts for axis in part.axes]
+    return tuple(f"{name}@-{age}" if age else name for age in range(group.history) for name in frame)
+
+
+def observation_space(cfg: TaskConfig, group: Group, actions: Box) -> Box:
+    """Return the bounds of an observation, in the order of `observation_names`; what has none is unbounded."""
+    command = cfg.commands
     turn = command.heading_limit if command.heading_gain > 0.0 else 0.0
     ranges = np.array([command.lin_vel_x, command.lin_vel_y, command.ang_vel_z]) + [[0.0, 0.0], [0.0, 0.0], [-turn, turn]]
-    blur = noise.base_quat if noise.enabled else 0.0
     bounds = {
         "last_action": (actions.low, actions.high),
-        "base_quat": (np.array([0.0, -1.0, -1.0, -1.0]) - blur, np.ones(4) + blur),
+        "base_quat": (np.array([0.0, -1.0, -1.0, -1.0]), np.ones(4)),
+        "projected_gravity": (-np.ones(3), np.ones(3)),
         "command": (ranges[:, 0], ranges[:, 1]),
         "phase": (-np.ones(2), np.ones(2)),
     }
-    low, high = (
-        np.concatenate([bounds[part][side] if part in bounds else np.full(size, infinity) for part, size in LAYOUT.items()])
-        for side, infinity in ((0, -np.inf), (1, np.inf))
-    )
     rounding = 1e-6  # what is exactly at its bound may lie a rounding error outside of it
-    return Box((low - rounding).astype(np.float32), (high + rounding).astype(np.float32), dtype=np.float32)
+    lows, highs = [], []
+    for part in group.parts:
+        term = cfg.observations[group.name].terms[part.name].get("term", part.name)
+        low, high = bounds.get(term, (np.full(part.size, -np.inf), np.full(part.size, np.inf)))
+        lows.append(low - part.noise - rounding)
+        highs.append(high + part.noise + rounding)
+    low, high = (np.tile(np.concatenate(side), group.history).astype(np.float32) for side in (lows, highs))
+    return Box(low, high, dtype=np.float32)
 
 
 def _numpy(tensor: Tensor) -> NDArray[Any]:

@@ -1,1 +1,1 @@
-"""The MDP as pure functions of batched tensors; `telebip.env` calls them in the order of one step."""
+"""The MDP, one function per term: see `telebip.mdp.term`; `telebip.env` calls them in the order of one step."""

@@ -1,4 +1,4 @@
-"""The heading hold of the velocity command."""
+"""The velocity command: when a new one is given, and the heading hold."""
 
 from torch import Tensor
 

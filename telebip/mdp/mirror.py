@@ -1,38 +1,32 @@
-"""The robot's mirror symmetry: right and left change places at the plane y = 0, and so do the phase signals."""
+"""The mirror image at the plane y = 0: right and left change places, and so do the phase signals.
 
-import torch
-from torch import Tensor
+The image of x is sign * x[order]. A vector that points somewhere (polar) changes its y; an axis of rotation (axial) keeps it
+and changes the others. What becomes of the joints is read from the MJCF, `telebip.robot.JointMirror`.
+"""
 
-from telebip.mdp.observations import LAYOUT
+from telebip.mdp.term import Mirror
+from telebip.robot import Robot
 
-_JOINTS = ([3, 4, 5, 0, 1, 2], [-1, 1, 1] * 2)  # the legs change places; a roll to the right becomes one to the left
-_POLAR, _AXIAL = ([0, 1, 2], [1, -1, 1]), ([0, 1, 2], [-1, 1, -1])  # vectors, and axes of rotation
+Image = tuple[list[int], list[float]]
+"""Which entry takes each place, and its sign."""
 
-MIRROR: dict[str, tuple[list[int], list[int]]] = {
-    "joint_pos": _JOINTS,
-    "joint_vel": _JOINTS,
-    "last_action": _JOINTS,
-    "base_lin_vel": _POLAR,
-    "base_ang_vel": _AXIAL,
-    "base_quat": ([0, 1, 2, 3], [1, -1, 1, -1]),
-    "command": ([0, 1, 2], [1, -1, -1]),
-    "phase": ([1, 0], [1, 1]),
+IMAGES: dict[Mirror, Image] = {
+    "polar": ([0, 1, 2], [1.0, -1.0, 1.0]),
+    "axial": ([0, 1, 2], [-1.0, 1.0, -1.0]),
+    "quat": ([0, 1, 2, 3], [1.0, -1.0, 1.0, -1.0]),
+    "command": ([0, 1, 2], [1.0, -1.0, -1.0]),
+    "feet": ([1, 0], [1.0, 1.0]),
 }
-"""For each part of the observation: which entry takes each place, and its sign."""
 
 
-def mirror_map(parts: list[str]) -> tuple[Tensor, Tensor]:
-    """Return the indices and signs that mirror a concatenation of `parts`: x[:, indices] * signs."""
-    indices: list[int] = []
-    signs: list[int] = []
-    for part in parts:
-        order, sign = MIRROR[part]
-        indices += [len(signs) + i for i in order]
-        signs += sign
-    return torch.tensor(indices), torch.tensor(signs, dtype=torch.float32)
-
-
-OBSERVATION = mirror_map(list(LAYOUT))
-ACTION = mirror_map(["last_action"])
-PHASE_RIGHT = sum(LAYOUT.values()) - LAYOUT["phase"]
-"""Column of p_r."""
+def image_of(mirror: Mirror, size: int, robot: Robot) -> Image | str:
+    """Return how `size` numbers of a kind are mirrored, or why they cannot be."""
+    if mirror == "none":
+        return "it declares no mirror image"
+    if mirror == "same":
+        return list(range(size)), [1.0] * size
+    if mirror == "joints":
+        joints = robot.mirror
+        return joints if isinstance(joints, str) else (list(joints.order), list(joints.sign))
+    image = IMAGES[mirror]
+    return image if len(image[0]) == size else f"it has {size} numbers, and a '{mirror}' one {len(image[0])}"

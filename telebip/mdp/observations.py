@@ -1,74 +1,107 @@
-"""What the policy sees: 33 numbers."""
+"""What is observed: one function per term, in SI units and without noise, which the group adds (`telebip.mdp.groups`).
 
-import torch
+A task lists the terms of a group in the order in which they are seen. A term declares its unit and how the plane y = 0 mirrors
+it (`telebip.mdp.mirror`); its size is that of what it returns.
+"""
+
+from typing import Literal
+
 from torch import Tensor
 
-from telebip.config.schema import NoiseConfig
-from telebip.math import columns, turn
-from telebip.sim.base import SimState
-
-LAYOUT: dict[str, int] = {
-    "joint_pos": 6,  # relative to the nominal pose [rad | m]
-    "joint_vel": 6,  # [rad/s | m/s]
-    "last_action": 6,  # [-]
-    "base_lin_vel": 3,  # body frame [m/s]
-    "base_ang_vel": 3,  # body frame [rad/s]
-    "base_quat": 4,  # w x y z, relative to the reference heading
-    "command": 3,  # vx, vy, yaw rate [m/s, m/s, rad/s]
-    "phase": 2,  # p_r, p_l [-]
-}
-"""Parts of the observation in their order, with their sizes."""
+from telebip.mdp.step import Step
+from telebip.mdp.term import observation
 
 
-def heading_relative_quat(base_quat: Tensor, reference_heading: Tensor) -> Tensor:
-    r"""Orientation of the trunk relative to the reference heading, with w >= 0.
+@observation(unit="rad | m, relative to the nominal pose", mirror="joints")
+def joint_pos(step: Step) -> Tensor:
+    """Joint positions, relative to the nominal pose [rad | m], (num_envs, num_joints)."""
+    return step.state.joint_pos - step.world.nominal
 
-        q_rel = q_z(-psi_ref) q
 
-    The reference heading starts at the robot's own at reset and turns with the commanded yaw rate. It equals the article's
-    base quaternion where the robot starts facing x and walks straight, and does not tell the policy which way x points.
+@observation(unit="rad/s | m/s", mirror="joints")
+def joint_vel(step: Step) -> Tensor:
+    """Joint velocities [rad/s | m/s], (num_envs, num_joints)."""
+    return step.state.joint_vel
+
+
+@observation(unit="output of the previous step", mirror="joints")
+def last_action(step: Step) -> Tensor:
+    """The previous action [-], (num_envs, num_joints)."""
+    return step.last_action
+
+
+@observation(unit="m/s, velocity of the trunk's frame (midway between the hips), in that frame", mirror="polar")
+def base_lin_vel(step: Step) -> Tensor:
+    """Linear velocity of the trunk, body frame [m/s], (num_envs, 3). No sensor of a real robot measures it."""
+    return step.base_lin_vel_b
+
+
+@observation(unit="rad/s, in the trunk's frame", mirror="axial")
+def base_ang_vel(step: Step) -> Tensor:
+    """Angular velocity of the trunk, body frame [rad/s], (num_envs, 3)."""
+    return step.base_ang_vel_b
+
+
+@observation(unit="w x y z with w >= 0, trunk relative to the reference heading", mirror="quat")
+def base_quat(step: Step) -> Tensor:
+    """Orientation of the trunk relative to the reference heading, w x y z, (num_envs, 4); see `Step.heading_quat`."""
+    return step.heading_quat
+
+
+@observation(unit="unit vector of gravity in the trunk's frame", mirror="polar")
+def projected_gravity(step: Step) -> Tensor:
+    """Direction of gravity, body frame: (0, 0, -1) where the trunk is upright [-], (num_envs, 3)."""
+    return step.projected_gravity
+
+
+@observation(unit="m/s forward, m/s left, rad/s", mirror="command")
+def command(step: Step) -> Tensor:
+    """The command (vx, vy, yaw rate), the heading hold's correction included [m/s, m/s, rad/s], (num_envs, 3)."""
+    return step.command
+
+
+@observation(unit="sin(2 pi t / gait_period) and its negative, t since the start", mirror="feet")
+def phase(step: Step) -> Tensor:
+    """Phase signals (p_r, p_l) [-], (num_envs, 2)."""
+    return step.phase
+
+
+@observation(unit="body weights, right and left", mirror="feet")
+def foot_force(step: Step) -> Tensor:
+    """Normal ground forces over the robot's weight, mean over the policy step [-], (num_envs, 2)."""
+    return step.state.foot_force / step.world.weight
+
+
+@observation(unit="sliding friction coefficient of the ground", mirror="same")
+def friction(step: Step) -> Tensor:
+    """Sliding friction of the ground [-], (num_envs, 1); the MJCF's where no event changes it."""
+    floor = step.world.sim.model.geom("floor").id
+    field = step.world.sim.model_fields.get("geom_friction")
+    if field is None:
+        return step.world.zeros(1) + float(step.world.sim.model.geom_friction[floor, 0])
+    return field[:, floor, :1].float()
+
+
+@observation(unit="body weights, in the trunk's frame", mirror="polar")
+def push_force(step: Step) -> Tensor:
+    """Force that pushed the trunk in the episode's last step, over the robot's weight, body frame [-], (num_envs, 3)."""
+    force_w = step.env.wrench_w[:, :3].masked_fill(step.is_new[:, None], 0.0)
+    return step.to_body(force_w) / step.world.weight
+
+
+@observation(unit="m above the ground", mirror="same")
+def base_height(step: Step) -> Tensor:
+    """Height of the trunk's frame, midway between the hips [m], (num_envs, 1)."""
+    return step.state.base_pos[:, 2:3]
+
+
+@observation(unit="as the MJCF's sensor", mirror=lambda *, sensor, mirror: mirror, sensors=lambda *, sensor, mirror: (sensor,))
+def sensor(step: Step, *, sensor: str, mirror: Literal["polar", "axial", "quat", "feet", "same", "none"] = "none") -> Tensor:
+    """A sensor of the MJCF by its name, as at the last physics step of the policy step, (num_envs, its size).
 
     Args:
-        base_quat: orientation in the world, (num_envs, 4).
-        reference_heading: psi_ref [rad], (num_envs,).
-
-    Returns:
-        Unit quaternion w x y z, (num_envs, 4); q and -q are the same rotation and give the same result.
+        step: the present step.
+        sensor: its name in the MJCF.
+        mirror: what it measures, for `ppo.symmetry`; "none" if it has no mirror image.
     """
-    quat = turn(base_quat, -reference_heading)
-    return torch.where(quat[:, :1] < 0.0, -quat, quat)
-
-
-def observation(
-    state: SimState,
-    nominal: Tensor,
-    last_action: Tensor,
-    base_lin_vel_b: Tensor,
-    quat: Tensor,
-    command: Tensor,
-    phase: Tensor,
-) -> Tensor:
-    """Concatenate the parts of `LAYOUT`, (num_envs, 33); see there for order, units and frames."""
-    parts = (
-        state.joint_pos - nominal,
-        state.joint_vel,
-        last_action,
-        base_lin_vel_b,
-        state.base_ang_vel_b,
-        quat,
-        command,
-        phase,
-    )
-    return columns(*parts)
-
-
-def noise_amplitude(cfg: NoiseConfig) -> Tensor:
-    """Amplitude of the uniform noise on each entry of the observation, (33,): zero for what the policy knows exactly."""
-    amplitude = {
-        "joint_pos": cfg.joint_pos,
-        "joint_vel": cfg.joint_vel,
-        "base_lin_vel": cfg.base_lin_vel,
-        "base_ang_vel": cfg.base_ang_vel,
-        "base_quat": cfg.base_quat,
-    }
-    return torch.cat([torch.full((size,), amplitude.get(part, 0.0)) for part, size in LAYOUT.items()])
+    return step.state.sensors[sensor]

@@ -4,7 +4,7 @@ A policy exported to ONNX is read as a checkpoint too: one that can be walked, b
 """
 
 import re
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +13,15 @@ from telebip.archive import DamagedArchiveError, load_archive, save_archive
 from telebip.config import TaskConfig, parse_config, to_yaml
 from telebip.errors import UserError
 from telebip.files import is_file, is_folder
-from telebip.mdp.observations import LAYOUT
+from telebip.rl.layout import Image, Layout
 from telebip.rl.onnx import OnnxPolicy
-from telebip.robot import JOINTS, Robot
+from telebip.robot import Robot
 
-FORMAT = "telebip-checkpoint-1"
+FORMAT = "telebip-checkpoint-2"
 POLICIES = ROOT / "assets" / "policies"
 CONTENT = {
-    **{"task": str, "config": str, "observation": dict, "action": list, "iteration": int, "samples": int},
-    **{"actor_state_dict": dict, "training": list, "robot": dict},
+    **{"task": str, "config": str, "iteration": int, "samples": int, "observations": dict, "joint_names": list},
+    **{"joint_mirror": (tuple, str), "actor_state_dict": dict, "training": list, "robot": dict},
 }
 """What a checkpoint file holds; the last two, not all of them do."""
 
@@ -35,9 +35,13 @@ class Checkpoint:
     config: TaskConfig
     iteration: int  # finished iterations
     samples: int  # environment steps seen in training
+    observations: Layout  # what the networks see
+    joint_names: list[str]  # what the actions move
+    joint_mirror: Image | str  # how those joints are mirrored, or why they cannot be
     learner: dict[str, Any]  # state dictionaries as `rsl_rl.algorithms.PPO.save` returns them; none in an ONNX file
-    training: list[dict[str, Any]] = field(default_factory=list)  # of each process: its worlds, generators and statistics
-    robot: dict[str, list[float]] = field(default_factory=dict)  # what `robot_properties` said of the robot trained on
+    training: list[dict[str, Any]]  # of each process: its worlds, generators and statistics; none where a policy is alone
+    robot: dict[str, list[float]]  # what `robot_properties` said of the robot trained on
+    missing: tuple[str, ...] = ()  # terms of the task that this process does not know, as "rewards.level"
     damaged: tuple[str, ...] = ()  # newer checkpoints of the same folder that could not be read: why, a line each
     beside: tuple[int, ...] = ()  # iterations of all checkpoints that its folder had when it was loaded
 
@@ -47,34 +51,14 @@ class Checkpoint:
         return self.path.suffix == ".onnx"
 
 
-def save_checkpoint(
-    path: Path,
-    task: str,
-    config: TaskConfig,
-    iteration: int,
-    samples: int,
-    learner: dict[str, Any],
-    training: list[dict[str, Any]] | None = None,
-    robot: dict[str, list[float]] | None = None,
-) -> None:
-    """Write a checkpoint to `path`: complete, or not at all. See `Checkpoint` for what it holds.
+def save_checkpoint(checkpoint: Checkpoint) -> None:
+    """Write a checkpoint to its `path`: complete, or not at all.
 
     Raises:
         OSError: it cannot be written.
     """
-    content = {
-        "format": FORMAT,
-        "task": task,
-        "config": to_yaml(config),
-        "observation": LAYOUT,
-        "action": list(JOINTS),
-        "iteration": iteration,
-        "samples": samples,
-        "robot": robot or {},
-        **learner,
-        **({"training": training} if training else {}),
-    }
-    save_archive(path, content)
+    own = {name: getattr(checkpoint, name) for name in CONTENT if name not in ("config", "actor_state_dict")}
+    save_archive(checkpoint.path, {"format": FORMAT, "config": to_yaml(checkpoint.config), **own, **checkpoint.learner})
 
 
 def prune_checkpoints(run_dir: Path, keep: int) -> None:
@@ -121,7 +105,7 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
         path: from the working directory, from telebip's own folder, or the name of a policy that comes with telebip.
 
     Raises:
-        UserError: there is none, it is damaged or unsafe, or its observations or actions are laid out differently.
+        UserError: there is none, it is damaged or unsafe, of another format, or its policy sees a term that is unknown here.
     """
     damaged: list[str] = []
     beside = tuple(_numbered(_find(Path(path))[0].resolve().parent))
@@ -139,30 +123,39 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
 
 def _load_file(file: Path) -> Checkpoint:
     content = load_archive(file, "checkpoint", FORMAT)
-    missing = CONTENT.keys() - content.keys() - {"training", "robot"}
-    if missing:
-        raise UserError(f"checkpoint '{file}' is not complete: it lacks {', '.join(sorted(missing))}")
+    absent = CONTENT.keys() - content.keys() - {"training", "robot"}
+    if absent:
+        raise UserError(f"checkpoint '{file}' is not complete: it lacks {', '.join(sorted(absent))}")
+    content = {"training": [], "robot": {}, **content}
     for name, kind in CONTENT.items():
-        if not isinstance(content.get(name, kind()), kind):
-            raise UserError(f"checkpoint '{file}' is not a telebip checkpoint: its {name} is no {kind.__name__}")
-    _check_layout(file, content["observation"], content["action"])
+        if not isinstance(content[name], kind):
+            expected = kind.__name__ if isinstance(kind, type) else " or ".join(one.__name__ for one in kind)
+            raise UserError(f"checkpoint '{file}' is not a telebip checkpoint: its {name} is no {expected}")
+    if "policy" not in content["observations"]:
+        raise UserError(f"checkpoint '{file}' is not complete: its observations lack the group 'policy'")
+    missing: list[str] = []
+    config = parse_config(content["config"], f"{file}:config", missing)
+    own = {name: content[name] for name in CONTENT if name not in ("config", "actor_state_dict")}
     learner = {key: value for key, value in content.items() if key.endswith("_state_dict")}
-    config = parse_config(content["config"], f"{file}:config")
-    training, robot = content.get("training", []), content.get("robot", {})
-    return Checkpoint(file, content["task"], config, content["iteration"], content["samples"], learner, training, robot)
+    return Checkpoint(file, config=config, learner=learner, missing=tuple(missing), **own)
 
 
 def _load_onnx(file: Path) -> Checkpoint:
-    metadata = OnnxPolicy(file).metadata
-    _check_layout(file, {part["name"]: part["size"] for part in metadata["observation"]}, metadata["joint_names"])
-    config = parse_config(metadata["config"], f"{file}:config")
-    return Checkpoint(file, metadata["task"], config, metadata["iteration"], metadata["samples"], learner={})
-
-
-def _check_layout(file: Path, observation: dict[str, int], action: list[str]) -> None:
-    for part, found, expected in (("observation", observation, LAYOUT), ("action", action, list(JOINTS))):
-        if found != expected:
-            raise UserError(f"checkpoint '{file}': its {part} layout {found} differs from this version's {expected}")
+    about, missing = OnnxPolicy(file).metadata, []
+    return Checkpoint(
+        path=file,
+        task=about["task"],
+        config=parse_config(about["config"], f"{file}:config", missing),
+        iteration=about["iteration"],
+        samples=about["samples"],
+        observations={"policy": about["observation"]},
+        joint_names=about["joint_names"],
+        joint_mirror="its mirror is inside of the ONNX file",
+        learner={},
+        training=[],
+        robot={},
+        missing=tuple(missing),
+    )
 
 
 def robot_properties(robot: Robot) -> dict[str, list[float]]:

@@ -4,14 +4,11 @@
 import contextlib
 import json
 import logging
-import os
 import warnings
 from collections.abc import Iterator
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import torch
 from rsl_rl.models import MLPModel
 from tensordict import TensorDict
@@ -20,27 +17,17 @@ from torch import Tensor, nn
 from telebip import __version__
 from telebip.config import to_yaml
 from telebip.errors import UserError
-from telebip.mdp.observations import LAYOUT
+from telebip.files import write_atomically
+from telebip.mdp.actions import scales
 from telebip.rl.checkpoint import Checkpoint
 from telebip.rl.onnx import INPUT, OUTPUT, OnnxPolicy, set_metadata
 from telebip.rl.policy import load_network
 from telebip.rl.run import git_revision
 from telebip.rl.symmetry import Canonical, SymmetricPolicy
-from telebip.robot import JOINTS, Robot, load_robot
+from telebip.robot import Robot, load_robot
 
 TOLERANCE = 1e-5
 """Largest difference between the actions of ONNX and torch that an export may show [-]; see `largest_difference`."""
-
-OBSERVATION_UNITS = {
-    "joint_pos": "relative to nominal_pose, in joint_unit",
-    "joint_vel": "joint_unit per second",
-    "last_action": "output of the previous step",
-    "base_lin_vel": "m/s, velocity of the trunk's frame (midway between the hips), in that frame",
-    "base_ang_vel": "rad/s, in the trunk's frame",
-    "base_quat": "w x y z with w >= 0, trunk relative to the reference heading",
-    "command": "m/s forward, m/s left, rad/s",
-    "phase": "sin(2 pi t / gait_period) and its negative, t since the start",
-}
 
 
 def export(checkpoint: Checkpoint, path: Path, samples: int = 10_000) -> float:
@@ -64,40 +51,47 @@ def export(checkpoint: Checkpoint, path: Path, samples: int = 10_000) -> float:
     difference = largest_difference(policy, OnnxPolicy(content), samples)
     if not difference <= TOLERANCE:
         raise UserError(f"not exported: actions of onnxruntime and torch differ by {difference:.1e}, more than {TOLERANCE:.0e}")
-    partial = path.with_name(path.name + ".partial")
     try:
-        partial.write_bytes(content)
-        os.replace(partial, path)
+        write_atomically(path, content)
     except OSError as error:
         raise UserError(f"cannot write '{path}': {error.strerror or error}") from error
     return difference
 
 
 def describe(checkpoint: Checkpoint, robot: Robot) -> dict[str, Any]:
-    """Return what one has to know to run the policy on a robot or in another simulator. Lists follow `joint_names`."""
-    config, model = checkpoint.config, robot.model
-    slides = [model.joint(name).type[0] == mujoco.mjtJoint.mjJNT_SLIDE for name in JOINTS]
-    scale = asdict(config.action)
+    """Return what one has to know to run the policy on a robot or in another simulator. Lists follow `joint_names`.
+
+    Delays of actions and observations, and noise, are the training's and not a part of it.
+
+    Raises:
+        UserError: the robot has other joints than the policy moves.
+    """
+    config, model, names = checkpoint.config, robot.model, checkpoint.joint_names
+    if names != list(robot.joint_names):
+        raise UserError(f"robot '{config.sim.robot}' has joints {list(robot.joint_names)}; the policy moves {names}")
     return {
         "task": checkpoint.task,
-        "joint_names": list(JOINTS),
-        "joint_unit": ["m" if slide else "rad" for slide in slides],
+        "joint_names": names,
+        "joint_unit": ["m" if slide else "rad" for slide in robot.is_slide],
         "nominal_pose": robot.nominal.tolist(),
-        "action_scale": [scale[name.split("_", 1)[1]] for name in JOINTS],  # joint target = nominal + scale * action
+        "action_scale": scales(config.actions.scale, robot.joint_names),  # joint target = nominal + scale * action
         "stiffness": model.actuator_gainprm[:, 0].tolist(),
         "damping": (-model.actuator_biasprm[:, 2]).tolist(),
         "force_limit": robot.force_limit.tolist(),
-        "force_unit": ["N" if slide else "N m" for slide in slides],  # stiffness and damping: per joint_unit, per joint_unit/s
-        # The network takes SI units as they are (scale 1); its normalisation is inside.
+        # Stiffness and damping: per joint_unit, and per joint_unit/s.
+        "force_unit": ["N" if slide else "N m" for slide in robot.is_slide],
+        # One frame, its parts in their order. The network takes SI units as they are (scale 1): it normalises itself.
         "observation": [
-            {"name": name, "size": size, "scale": 1.0, "unit": OBSERVATION_UNITS[name]} for name, size in LAYOUT.items()
+            {"name": part["name"], "size": part["size"], "scale": 1.0, "unit": part["unit"]}
+            for part in checkpoint.observations["policy"]
         ],
+        "history": config.observations["policy"].history,  # frames that it takes, one of each policy step, the newest first
         "physics_dt": robot.physics_dt,  # s
         "step_dt": robot.physics_dt * config.sim.decimation,  # s
         "gait_period": config.gait.period,  # s
-        "command_range": {name: list(getattr(config.command, name)) for name in ("lin_vel_x", "lin_vel_y", "ang_vel_z")},
-        "heading_gain": config.command.heading_gain,  # 1/s
-        "heading_limit": config.command.heading_limit,  # rad/s
+        "command_range": {name: list(getattr(config.commands, name)) for name in ("lin_vel_x", "lin_vel_y", "ang_vel_z")},
+        "heading_gain": config.commands.heading_gain,  # 1/s
+        "heading_limit": config.commands.heading_limit,  # rad/s
         "iteration": checkpoint.iteration,
         "samples": checkpoint.samples,
         "telebip_version": __version__,
@@ -126,15 +120,15 @@ def largest_difference(policy: MLPModel | SymmetricPolicy, exported: OnnxPolicy,
 
 
 class _Mirrored(nn.Module):
-    """`SymmetricPolicy` on plain tensors."""
+    """`SymmetricPolicy` on the plain vector of the group "policy"."""
 
     def __init__(self, network: nn.Module, canonical: Canonical) -> None:
         super().__init__()
         self.network, self.canonical = network, canonical
 
     def forward(self, obs: Tensor) -> Tensor:
-        seen, mirrored = self.canonical.observe(obs)
-        return self.canonical.act(self.network(seen), mirrored)
+        mirrored = self.canonical.is_mirrored(obs)
+        return self.canonical.act(self.network(self.canonical.observe("policy", obs, mirrored)), mirrored)
 
 
 def _actor(policy: MLPModel | SymmetricPolicy) -> MLPModel:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from telebip.errors import UserError
 
-FORMAT = "telebip-onnx-1"
+FORMAT = "telebip-onnx-2"
 INPUT, OUTPUT = "obs", "actions"
 
 
@@ -50,7 +50,7 @@ class OnnxPolicy:
         """Nothing to forget."""
 
     def act(self, obs: np.ndarray) -> np.ndarray:
-        """Return the actions (num_envs, 6) for float32 observations (num_envs, 33)."""
+        """Return the actions (num_envs, num_joints) for float32 observations (num_envs, size)."""
         return self._session.run([OUTPUT], {INPUT: obs})[0]  # type: ignore[return-value]
 
     def _metadata(self, name: str) -> dict[str, Any]:

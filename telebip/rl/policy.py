@@ -1,38 +1,19 @@
-"""From a configuration to rsl-rl's networks, and from a checkpoint to a policy."""
+"""From a checkpoint to a policy."""
 
-from typing import Any
+from collections.abc import Sequence
 
 import torch
 from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 
-from telebip.config.schema import PpoConfig
 from telebip.control.policy import Policy
+from telebip.env import TelebipEnv
 from telebip.errors import UserError
-from telebip.mdp.observations import LAYOUT
 from telebip.rl.checkpoint import Checkpoint
+from telebip.rl.layout import described, obs_groups, width
+from telebip.rl.networks import actor_cfg
 from telebip.rl.onnx import OnnxPolicy
-from telebip.rl.symmetry import SymmetricPolicy
-from telebip.robot import JOINTS
-
-OBS_GROUPS = {"actor": ["policy"], "critic": ["policy"]}
-
-
-def actor_cfg(ppo: PpoConfig) -> dict[str, Any]:
-    """Arguments of the actor's `MLPModel`: a Gaussian whose mean is an MLP and whose deviation is a parameter."""
-    return {
-        **critic_cfg(ppo),
-        "distribution_cfg": {
-            "class_name": "GaussianDistribution",
-            "init_std": ppo.init_std,
-            "std_range": (ppo.min_std, 1e6),
-        },
-    }
-
-
-def critic_cfg(ppo: PpoConfig) -> dict[str, Any]:
-    """Arguments of the critic's `MLPModel`."""
-    return {"hidden_dims": list(ppo.hidden_dims), "activation": ppo.activation, "obs_normalization": ppo.obs_normalization}
+from telebip.rl.symmetry import Canonical, SymmetricPolicy
 
 
 def load_policy(checkpoint: Checkpoint, device: str | torch.device) -> Policy:
@@ -54,11 +35,35 @@ def load_network(checkpoint: Checkpoint, device: str | torch.device = "cpu") -> 
     """
     if checkpoint.is_onnx:
         raise UserError(f"'{checkpoint.path}' is an ONNX file already; export needs a checkpoint (.pt) or a run folder")
-    obs = TensorDict({"policy": torch.zeros(1, sum(LAYOUT.values()))}, batch_size=[1])
-    actor = MLPModel(obs, OBS_GROUPS, "actor", len(JOINTS), **actor_cfg(checkpoint.config.ppo))
+    config, layout = checkpoint.config, {"policy": checkpoint.observations["policy"]}
+    obs = TensorDict({"policy": torch.zeros(1, width(layout, config, "policy"))}, batch_size=[1])
+    actor = MLPModel(obs, obs_groups(layout), "actor", len(checkpoint.joint_names), **actor_cfg(config.ppo))
     try:
         actor.load_state_dict(checkpoint.learner["actor_state_dict"])
     except (RuntimeError, KeyError, TypeError, AttributeError) as error:
         raise UserError(f"checkpoint '{checkpoint.path}': its weights do not fit its configuration") from error
-    policy = SymmetricPolicy(actor, device) if checkpoint.config.ppo.symmetry == "phase" else actor
+    policy = actor
+    if config.ppo.symmetry == "phase":
+        policy = SymmetricPolicy(actor, Canonical(config, layout, checkpoint.joint_mirror))
     return policy.to(device).eval()
+
+
+def require_fit(checkpoint: Checkpoint, env: TelebipEnv, groups: Sequence[str] = ("policy",)) -> None:
+    """Refuse an environment in which the checkpoint's networks would see or move something else than they have learned with.
+
+    Raises:
+        UserError: the joints differ, or what is in one of `groups`.
+    """
+    theirs, own = checkpoint.joint_names, list(env.robot.joint_names)
+    if theirs != own:
+        raise UserError(
+            f"checkpoint '{checkpoint.path}' was trained on another robot than '{env.cfg.sim.robot}': it moves the joints "
+            f"{', '.join(theirs)}, not {', '.join(own)}"
+        )
+    for group in groups:
+        seen, given = (
+            described(layout, config, group)
+            for layout, config in ((checkpoint.observations, checkpoint.config), (env.layout(), env.cfg))
+        )
+        if seen != given:
+            raise UserError(f"checkpoint '{checkpoint.path}' sees observations.{group} as {seen}; here it is {given}")

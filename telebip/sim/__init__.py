@@ -3,8 +3,9 @@
 from collections.abc import Sequence
 
 import torch
+from mujoco.batch import MODEL_FIELDS
 
-from telebip.errors import UserError
+from telebip.errors import UserError, nearest
 from telebip.robot import Robot
 from telebip.sim.base import Backend, SimState, Simulator
 
@@ -32,19 +33,34 @@ def make_simulator(
     decimation: int,
     device: torch.device,
     model_fields: Sequence[str] = (),
+    sensors: Sequence[str] = (),
     capacity: tuple[int, int] = (8, 64),
 ) -> Simulator:
-    """Create the backend, see `choose_backend`. `capacity` is `warp`'s, see there.
+    """Create the backend, see `choose_backend`.
+
+    Args:
+        backend: which.
+        robot: the model.
+        num_envs: number of worlds.
+        decimation: physics steps per `Simulator.step`.
+        device: where tensors live.
+        model_fields: names of `mujoco.MjModel` fields that get one value per world.
+        sensors: names of the sensors to keep in `SimState.sensors`.
+        capacity: room for contacts and for constraints per world, on `warp`.
 
     Raises:
-        UserError: `native` was asked for on a CUDA device.
+        UserError: `native` was asked for on a CUDA device; there is no such field or sensor, or the engine lacks what the
+            robot needs.
     """
+    for name in model_fields:
+        if name not in MODEL_FIELDS:
+            raise UserError(f"no field '{name}' in MuJoCo's model; {nearest(name, MODEL_FIELDS)}")
     if choose_backend(backend, device) == "native":
         if device.type != "cpu":
             raise UserError(f"backend 'native' runs on the CPU, not on '{device}'; use --backend warp or --device cpu")
         from telebip.sim.native import NativeSimulator
 
-        return NativeSimulator(robot, num_envs, decimation, model_fields)
+        return NativeSimulator(robot, num_envs, decimation, model_fields, sensors)
     from telebip.sim.warp import WarpSimulator
 
-    return WarpSimulator(robot, num_envs, decimation, indexed(device), model_fields, *capacity)
+    return WarpSimulator(robot, num_envs, decimation, indexed(device), model_fields, sensors, *capacity)

@@ -1,15 +1,21 @@
+# pyright: reportAttributeAccessIssue=false
 """The boundary between the MDP and the physics engines."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
+import mujoco
 import torch
 from torch import Tensor
 
 from telebip.math import zeros
+from telebip.robot import FEET, Robot
 
 Backend = Literal["auto", "native", "warp"]
+
+Columns = slice | Tensor
+"""Which columns: a slice where they lie side by side, as on most robots, which spares a copy, else their numbers."""
 
 ENGINE_FAULTS = ("engine_warning", "engine_error", "capacity")
 """What an engine reports of a world itself: a warning, an error, or more contacts or constraints than there is room for."""
@@ -20,17 +26,17 @@ class SimState:
     """State of all worlds after a policy step: float32 views of buffers that the next `step` or `reset` overwrites.
 
     Forces and power are means over the step's physics steps, so that a 5 ms impact counts for what it carries, not for
-    whether it fell on the sampled step; `reset` leaves them at zero. Joints in the order of `telebip.robot.JOINTS`.
+    whether it fell on the sampled step. Joints in the order of `Robot.joint_names`.
     """
 
-    qpos: Tensor  # (num_envs, 13): trunk position [m] and quaternion, joint positions [rad | m]
-    qvel: (
-        Tensor  # (num_envs, 12): trunk velocity, world frame [m/s], angular velocity, body frame [rad/s], joints [rad/s | m/s]
-    )
+    qpos: Tensor  # (num_envs, nq): trunk position [m] and quaternion, then the other joints' positions [rad | m]
+    qvel: Tensor  # (num_envs, nv): trunk velocity, world frame [m/s], angular velocity, body frame [rad/s], then the others'
     foot_force: Tensor  # (num_envs, 2): normal ground force on the right and the left foot [N]
-    joint_force: Tensor  # (num_envs, 6): actuator force [N m | N]
-    joint_power: Tensor  # (num_envs, 6): |actuator force x joint velocity| [W]
-    joint_net_power: Tensor  # (num_envs, 6): actuator force x joint velocity, negative where the actuator brakes [W]
+    joint_force: Tensor  # (num_envs, num_joints): actuator force [N m | N]
+    joint_power: Tensor  # (num_envs, num_joints): |actuator force x joint velocity| [W]
+    joint_net_power: Tensor  # (num_envs, num_joints): the same with its sign, negative where the actuator brakes [W]
+    sensors: dict[str, Tensor]  # (num_envs, size) each: those asked for, at the step's last physics step, before it moved
+    joint_columns: Columns  # of the actuated joints in `qpos`; in `qvel` they stand one column further left
 
     @property
     def base_pos(self) -> Tensor:
@@ -44,8 +50,8 @@ class SimState:
 
     @property
     def joint_pos(self) -> Tensor:
-        """Joint positions [rad | m], (num_envs, 6)."""
-        return self.qpos[:, 7:]
+        """Positions of the actuated joints [rad | m], (num_envs, num_joints)."""
+        return self.qpos[:, self.joint_columns]
 
     @property
     def base_lin_vel_w(self) -> Tensor:
@@ -59,18 +65,34 @@ class SimState:
 
     @property
     def joint_vel(self) -> Tensor:
-        """Joint velocities [rad/s | m/s], (num_envs, 6)."""
-        return self.qvel[:, 6:]
+        """Velocities of the actuated joints [rad/s | m/s], (num_envs, num_joints)."""
+        return self.qvel[:, shifted(self.joint_columns)]
 
     @property
-    def step_means(self) -> tuple[Tensor, ...]:
-        """The buffers that hold means over a policy step."""
-        return self.foot_force, self.joint_force, self.joint_power, self.joint_net_power
+    def step_values(self) -> dict[str, Tensor]:
+        """What only a step fills, and `reset` and `load` leave at zero: means over the policy step, and sensors."""
+        means = ("foot_force", "joint_force", "joint_power", "joint_net_power")
+        return {name: getattr(self, name) for name in means} | {f"sensors.{name}": v for name, v in self.sensors.items()}
 
     @staticmethod
-    def zeros(num_envs: int, device: torch.device) -> "SimState":
-        """Allocate the buffers."""
-        return SimState(*(zeros(num_envs, size, device=device) for size in (13, 12, 2, 6, 6, 6)))
+    def zeros(robot: Robot, num_envs: int, device: torch.device, sensors: Sequence[str] = ()) -> "SimState":
+        """Allocate the buffers, `sensors` those of the robot's of these names."""
+        num_joints = len(robot.joint_names)
+        sizes = (robot.model.nq, robot.model.nv, len(FEET), num_joints, num_joints, num_joints)
+        values = {name: zeros(num_envs, int(robot.model.sensor(name).dim[0]), device=device) for name in sensors}
+        numbers = (zeros(num_envs, size, device=device) for size in sizes)
+        return SimState(*numbers, sensors=values, joint_columns=columns_on(device, robot))
+
+
+def columns_on(device: torch.device, robot: Robot) -> Columns:
+    """Return `Robot.joint_columns`, to index tensors of `device` with: a recorded CUDA graph cannot bring a list there."""
+    columns = robot.joint_columns
+    return columns if isinstance(columns, slice) else torch.tensor(columns, device=device)
+
+
+def shifted(columns: Columns) -> Columns:
+    """Return the columns of `qvel` of the joints that have these in `qpos`: the trunk's quaternion has one number more."""
+    return slice(columns.start - 1, columns.stop - 1) if isinstance(columns, slice) else columns - 1
 
 
 class Simulator(Protocol):
@@ -78,47 +100,63 @@ class Simulator(Protocol):
 
     num_envs: int
     device: torch.device
-    state: SimState
-    model_fields: dict[str, Tensor]
-    """Live per-world copies of the model fields named at construction, (num_envs, ...); writes act from the next step."""
     backend: Backend
     """Its name."""
+    model: mujoco.MjModel
+    """The model that it steps, `Robot.engine_model`: ids of bodies, geoms and so on are this one's."""
+    state: SimState
+    model_fields: dict[str, Tensor]
+    """Live per-world copies of the model fields named at construction, (num_envs, ...); writes act from the next step, with
+    what MuJoCo derives from them after `refresh_constants`."""
     faults: Tensor
     """Which of `ENGINE_FAULTS` befell which world in the last `step`: bool, (3, num_envs)."""
     advice: dict[str, str]
     """What the engine says about a kind of `faults`: which setting to change, or its message."""
     memory: dict[str, Tensor]
-    """Live tensors, in the engine's own precision, of all else that the outcome of a `step` depends on."""
+    """Live tensors, in the engine's own precision: its whole state by MuJoCo's own definition (mjSTATE_INTEGRATION), less what
+    `step` sets anew; with `model_fields`, the outcome of a `step` depends on nothing else."""
     memory_before: dict[str, Tensor]
     """Copies of `memory` from before the last `step`."""
 
     def step(self, targets: Tensor, wrench_w: Tensor) -> SimState:
-        """Hold joint `targets` (num_envs, 6) [rad | m] and the trunk wrench for one policy step, and return `state`.
+        """Hold joint `targets` [rad | m] and the trunk wrench for one policy step, and return `state`.
 
         Args:
-            targets: setpoints of the six position actuators.
+            targets: setpoints of the position actuators, (num_envs, num_joints); or one for each physics step,
+                (num_envs, decimation, num_joints).
             wrench_w: force and torque on the trunk's centre of mass, world frame [N, N m], (num_envs, 6).
         """
         ...
 
-    def write(self, targets: Tensor, wrench_w: Tensor) -> None:
-        """Set the inputs of `step`, and do no more; for `advance`."""
-        ...
-
-    def advance(self) -> None:
-        """Run the engine's physics steps of one policy step and nothing else, to measure `step` against.
-
-        The worlds go where `step` with the inputs last written would take them; `state` need not follow.
-        """
-        ...
-
     def reset(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
-        """Overwrite the worlds where `mask` (num_envs,) holds with rows of `qpos` (num_envs, 13) and `qvel` (num_envs, 12).
+        """Overwrite the worlds where `mask` (num_envs,) holds with rows of `qpos` (num_envs, nq) and `qvel` (num_envs, nv).
 
         A reset world has no memory: its next step is the same, bit for bit, as that of a new simulator in that state.
         """
         ...
 
     def load(self, memory: Mapping[str, Tensor]) -> None:
-        """Go on from a copy of `memory`, bit for bit; `state` has its positions and velocities, and means of zero."""
+        """Go on from a copy of `memory`, bit for bit; `state` has its positions and velocities, see `SimState.step_values`."""
         ...
+
+    def refresh_constants(self, mask: Tensor) -> None:
+        """Bring what MuJoCo derives from `model_fields` (mj_setConst) up to date, at least where `mask` (num_envs,) holds."""
+        ...
+
+
+def state_fields(model: mujoco.MjModel) -> tuple[str, ...]:
+    """Return the fields of MuJoCo's data that are its state (mjSTATE_INTEGRATION), less those that `Simulator.step` sets."""
+    renamed = {"warmstart": "qacc_warmstart", "plugin": "plugin_state"}
+    fields = []
+    for name, value in mujoco.mjtState.__members__.items():
+        bit = int(value) & int(mujoco.mjtState.mjSTATE_INTEGRATION)
+        is_part = name.startswith("mjSTATE_") and bit.bit_count() == 1 and mujoco.mj_stateSize(model, bit) > 0
+        if is_part and value not in (mujoco.mjtState.mjSTATE_CTRL, mujoco.mjtState.mjSTATE_XFRC_APPLIED):
+            part = name.removeprefix("mjSTATE_").lower()
+            fields.append(renamed.get(part, part))
+    return tuple(fields)
+
+
+def derives(model_fields: Sequence[str]) -> bool:
+    """Whether MuJoCo derives anything from these fields of its model, which `Simulator.refresh_constants` must then renew."""
+    return not set(mujoco.MjModel._setconst_inputs).isdisjoint(model_fields)

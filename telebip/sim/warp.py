@@ -4,18 +4,28 @@
 The only file that imports `mujoco_warp`. Torch tensors and Warp arrays share memory in both directions.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import mujoco_warp as mjw
 import torch
 import warp as wp
 from torch import Tensor
 
-from telebip.robot import Robot
-from telebip.sim.base import ENGINE_FAULTS, Backend, SimState
+from telebip.errors import UserError
+from telebip.robot import FOOT_SENSORS, TRUNK, Robot
+from telebip.sim.base import ENGINE_FAULTS, Backend, SimState, columns_on, derives, state_fields
 
 CAPACITY = int(mjw.OverflowType.ALL & ~(mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS))
 """Overflows that truncate the physics; the MJCF's limits on solver iterations are meant."""
+
+MEANS = ("joint_force", "joint_power", "joint_net_power", "foot_force")
+"""Fields of `SimState` that `_accumulate` fills, in its order."""
+
+DERIVED = (
+    *("body_subtreemass", "body_invweight0", "dof_invweight0", "tendon_invweight0", "tendon_length0", "actuator_acc0"),
+    *("geom_aabb", "geom_rbound", "eq_data", "cam_pos0", "cam_poscom0", "cam_mat0"),
+)
+"""Fields of the model that `mjw.set_const` computes."""
 
 
 @wp.kernel
@@ -55,6 +65,7 @@ class WarpSimulator:
         decimation: int,
         device: torch.device,
         model_fields: Sequence[str] = (),
+        sensors: Sequence[str] = (),
         max_contacts: int = 8,
         max_constraints: int = 64,
     ) -> None:
@@ -66,130 +77,157 @@ class WarpSimulator:
             decimation: physics steps per `step`.
             device: where to simulate.
             model_fields: names of model fields that get one value per world.
+            sensors: names of the sensors to keep in `state`.
             max_contacts: room for contacts, per world.
             max_constraints: room for rows of the constraint solver, per world.
+
+        Raises:
+            UserError: the engine lacks something of the robot, or has one value of a field for all worlds.
         """
-        self.num_envs = num_envs
-        self.device = device
+        self.num_envs, self.device = num_envs, device
+        self.model = robot.engine_model(sensors)
         self._decimation = decimation
-        self._foot_adr = robot.engine_foot_sensor_adr
+        self._derives = derives(model_fields)
         wp.config.log_level = wp.LOG_WARNING  # not a line for each of a hundred kernels
         wp.init()
         self._wp_device = wp.device_from_torch(device)
+        per_world = (*model_fields, *(DERIVED if self._derives else ()))
         with wp.ScopedDevice(self._wp_device):
-            self._model = mjw.put_model(robot.engine_model, batch_sizes=dict.fromkeys(model_fields, num_envs))
-            self._model.opt.warn_overflow = 0  # `faults` has them
-            self._data = mjw.make_data(robot.engine_model, nworld=num_envs, nconmax=max_contacts, njmax=max_constraints)
-        self.model_fields = {name: wp.to_torch(getattr(self._model, name)) for name in model_fields}
-        for name, field in self.model_fields.items():
-            field.copy_(
-                torch.as_tensor(getattr(robot.engine_model, name), dtype=field.dtype).reshape(field.shape[1:]).expand_as(field)
-            )
-        self.state = SimState(
-            qpos=wp.to_torch(self._data.qpos),
-            qvel=wp.to_torch(self._data.qvel),
-            foot_force=torch.zeros(num_envs, 2, device=device),
-            joint_force=torch.zeros(num_envs, 6, device=device),
-            joint_power=torch.zeros(num_envs, 6, device=device),
-            joint_net_power=torch.zeros(num_envs, 6, device=device),
-        )
-        state = self.state
-        self._means = [
-            wp.from_torch(mean) for mean in (state.joint_force, state.joint_power, state.joint_net_power, state.foot_force)
-        ]
-        self._ctrl, self._warmstart, self._time = (
-            wp.to_torch(a) for a in (self._data.ctrl, self._data.qacc_warmstart, self._data.time)
-        )
-        self.memory = {"qpos": state.qpos, "qvel": state.qvel, "qacc_warmstart": self._warmstart, "time": self._time}
-        self._live = [wp.from_torch(memory) for memory in self.memory.values()]
+            try:
+                self.mjw_model = mjw.put_model(self.model, batch_sizes=dict.fromkeys(per_world, num_envs))
+            except (NotImplementedError, ValueError) as error:
+                raise UserError(f"{robot.path}: backend 'warp': {error}") from error
+            self.mjw_model.opt.warn_overflow = 0  # `faults` has them
+            self.mjw_data = mjw.make_data(self.model, nworld=num_envs, nconmax=max_contacts, njmax=max_constraints)
+            self._schedule = [wp.zeros_like(self.mjw_data.ctrl) for _ in range(decimation)]  # controls of each physics step
+        data = self.mjw_data
+        self.model_fields = {name: wp.to_torch(getattr(self.mjw_model, name)) for name in model_fields}
+        # Equality constraints read the velocities that bodies had in the step before.
+        fields = (*state_fields(self.model), *(("cvel",) if self.model.neq else ()))
+        self.memory = {name: wp.to_torch(getattr(data, name)) for name in fields}
+        self._default = {name: live.clone() for name, live in self.memory.items()}  # as mj_resetData leaves them
+        self._live = [getattr(data, name) for name in self.memory]
         self._copies = [wp.clone(array) for array in self._live]
         self.memory_before = {name: wp.to_torch(copy) for name, copy in zip(self.memory, self._copies, strict=True)}
-        self._trunk_wrench = wp.to_torch(self._data.xfrc_applied)[:, robot.trunk_id]
+        self.state = self._make_state(robot, sensors)
+        self._means = [wp.from_torch(getattr(self.state, name)) for name in MEANS]
+        self._ctrl, self._overflow = wp.to_torch(data.ctrl), wp.to_torch(data.overflow)
+        self._targets = [wp.to_torch(controls) for controls in self._schedule]
+        self._trunk_wrench = wp.to_torch(data.xfrc_applied)[:, self.model.body(TRUNK).id]
+        self._foot_adr = [int(self.model.sensor(name).adr[0]) for name in FOOT_SENSORS]
         self.advice = {
             "capacity": f"raise sim.max_contacts ({max_contacts}) or sim.max_constraints ({max_constraints}), both per world"
         }
-        self._overflow = wp.to_torch(self._data.overflow)
         self.faults = torch.zeros(len(ENGINE_FAULTS), num_envs, dtype=torch.bool, device=device)  # warns of nothing else
-        self._graphs = {True: self._capture(complete=True)} if self._wp_device.is_cuda else {}
+        self._graphs: dict[Callable[[], None], wp.Graph] = {}
+        if self._wp_device.is_cuda:
+            self._graphs[self._hold] = self._record(self._hold)
         home = torch.as_tensor(robot.home_qpos, dtype=torch.float32, device=device).expand(num_envs, -1)
-        self.reset(torch.ones(num_envs, dtype=torch.bool, device=device), home, torch.zeros(num_envs, 12, device=device))
+        everywhere = torch.ones(num_envs, dtype=torch.bool, device=device)
+        self.reset(everywhere, home, torch.zeros(num_envs, self.model.nv, device=device))
 
     def step(self, targets: Tensor, wrench_w: Tensor) -> SimState:
         """See `Simulator.step`."""
-        self.write(targets, wrench_w)
-        self._run(complete=True)
+        self._trunk_wrench.copy_(wrench_w)
+        if targets.dim() == 2:
+            self._ctrl.copy_(targets)
+            self._do(self._hold)
+        else:
+            for controls, target in zip(self._targets, targets.unbind(1), strict=True):
+                controls.copy_(target)
+            self._do(self._follow)
         torch.bitwise_and(self._overflow, CAPACITY, out=self._overflow)
         torch.ne(self._overflow, 0, out=self.faults[ENGINE_FAULTS.index("capacity")])
         self._overflow.zero_()
         return self.state
 
-    def write(self, targets: Tensor, wrench_w: Tensor) -> None:
-        """See `Simulator.write`."""
-        self._ctrl.copy_(targets)
-        self._trunk_wrench.copy_(wrench_w)
-
-    def advance(self) -> None:
-        """See `Simulator.advance`; on CUDA the first call records a graph, and leaves the worlds some steps further on."""
-        self._run(complete=False)
-        self._overflow.zero_()
-
     def reset(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
         """See `Simulator.reset`."""
-        rows = mask[:, None]
-        self.state.qpos.copy_(torch.where(rows, qpos, self.state.qpos))
-        self.state.qvel.copy_(torch.where(rows, qvel, self.state.qvel))
-        for target in (self._warmstart, self._time, *self.state.step_means):
-            target.masked_fill_(rows if target.dim() == 2 else mask, 0.0)
+        new = self._default | {"qpos": qpos, "qvel": qvel}
+        for name, live in self.memory.items():
+            live.copy_(torch.where(_over(mask, live), new[name], live))
+        for value in self.state.step_values.values():
+            value.masked_fill_(_over(mask, value), 0.0)
 
     def load(self, memory: Mapping[str, Tensor]) -> None:
         """See `Simulator.load`."""
         for name, live in self.memory.items():
             live.copy_(memory[name])
-        for mean in self.state.step_means:
-            mean.zero_()
+        for value in self.state.step_values.values():
+            value.zero_()
 
-    def _run(self, complete: bool) -> None:
-        """Run the physics steps of one policy step: on CUDA as a graph, recorded at its first use."""
+    def refresh_constants(self, mask: Tensor) -> None:
+        """See `Simulator.refresh_constants`; it does so in all worlds."""
+        if self._derives:
+            self._do(self._set_const)
+
+    def _make_state(self, robot: Robot, sensors: Sequence[str]) -> SimState:
+        """Return the state: positions, velocities and sensors are the engine's own buffers."""
+        data, places = wp.to_torch(self.mjw_data.sensordata), {name: self.model.sensor(name) for name in sensors}
+        sizes = {name: len(FOOT_SENSORS) if name == "foot_force" else self.model.nu for name in MEANS}
+        return SimState(
+            qpos=self.memory["qpos"],
+            qvel=self.memory["qvel"],
+            **{name: torch.zeros(self.num_envs, size, device=self.device) for name, size in sizes.items()},
+            sensors={name: data[:, place.adr[0] : place.adr[0] + place.dim[0]] for name, place in places.items()},
+            joint_columns=columns_on(self.device, robot),
+        )
+
+    def _hold(self) -> None:
+        """Do the physics steps of one policy step with the present controls, and fill `memory_before` and the means."""
+        self._advance([])
+
+    def _follow(self) -> None:
+        """Do the same with the controls of each physics step."""
+        self._advance(self._schedule)
+
+    def _advance(self, schedule: list[wp.array]) -> None:
+        data = self.mjw_data
+        for copy, live in zip(self._copies, self._live, strict=True):
+            wp.copy(copy, live)
+        for mean in self._means:
+            mean.zero_()
+        for i in range(self._decimation):
+            if schedule:
+                wp.copy(data.ctrl, schedule[i])
+            mjw.step(self.mjw_model, data)
+            wp.launch(
+                _accumulate,
+                dim=(self.num_envs, self.model.nu),
+                inputs=[data.actuator_force, data.actuator_velocity, data.sensordata, *self._foot_adr, 1.0 / self._decimation],
+                outputs=self._means,
+            )
+
+    def _set_const(self) -> None:
+        mjw.set_const(self.mjw_model, self.mjw_data, restore=False)
+
+    def _do(self, work: Callable[[], None]) -> None:
+        """Do `_hold`, `_follow` or `_set_const`: on CUDA as a graph, recorded at its first use."""
         if not self._wp_device.is_cuda:
-            self._launch(complete)
+            with wp.ScopedDevice(self._wp_device):
+                work()
             return
-        if complete not in self._graphs:
-            self._graphs[complete] = self._capture(complete)
+        if work not in self._graphs:
+            self._graphs[work] = self._record(work)
         # On torch's stream, so that torch's work before and after is ordered with it without a synchronisation.
         with torch.cuda.device(self.device):  # the default stream's handle means that of the current device
-            wp.capture_launch(self._graphs[complete], stream=wp.stream_from_torch(torch.cuda.current_stream(self.device)))
+            wp.capture_launch(self._graphs[work], stream=wp.stream_from_torch(torch.cuda.current_stream(self.device)))
 
-    def _launch(self, complete: bool) -> None:
-        """Run the physics steps of one policy step, and if `complete` all else of `step`: `memory_before` and the means."""
+    def _record(self, work: Callable[[], None]) -> wp.Graph:
+        """Record a CUDA graph. Doing the work once compiles and loads its kernels before; the worlds stay where they are."""
+        memory = {name: live.clone() for name, live in self.memory.items()}
+        torch.cuda.synchronize(self.device)
         with wp.ScopedDevice(self._wp_device):
-            if complete:
-                for copy, live in zip(self._copies, self._live, strict=True):
-                    wp.copy(copy, live)
-                for mean in self._means:
-                    mean.zero_()
-            for _ in range(self._decimation):
-                mjw.step(self._model, self._data)
-                if not complete:
-                    continue
-                wp.launch(
-                    _accumulate,
-                    dim=(self.num_envs, 6),
-                    inputs=[
-                        self._data.actuator_force,
-                        self._data.actuator_velocity,
-                        self._data.sensordata,
-                        *self._foot_adr,
-                        1.0 / self._decimation,
-                    ],
-                    outputs=self._means,
-                )
-
-    def _capture(self, complete: bool) -> wp.Graph:
-        """Compile and warm up, then record `_launch` as a CUDA graph."""
-        wp.synchronize_device(self._wp_device)
-        self._launch(complete)
-        with wp.ScopedCapture(device=self._wp_device) as capture:
-            self._launch(complete)
+            work()
+            with wp.ScopedCapture() as capture:
+                work()
         wp.synchronize_device(self._wp_device)  # from here on everything runs on torch's stream
-        self._overflow.zero_()  # that of a pose that nobody asked for
+        for name, live in self.memory.items():
+            live.copy_(memory[name])
+        self._overflow.zero_()  # that of a step that nobody asked for
         return capture.graph  # type: ignore[return-value]
+
+
+def _over(mask: Tensor, values: Tensor) -> Tensor:
+    """Return `mask` (num_envs,) with the dimensions of `values` (num_envs, ...)."""
+    return mask.view(-1, *[1] * (values.dim() - 1))

@@ -1,9 +1,11 @@
 """The prepared layouts of recordings in the rerun viewer: the robots on the left, time series on the right."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import rerun as rr
 import rerun.blueprint as rrb
+
+from telebip.viz.series import SHARED, Plot, Row
 
 AROUND_THE_CURSOR = rrb.VisibleTimeRange(
     "time",
@@ -13,40 +15,35 @@ AROUND_THE_CURSOR = rrb.VisibleTimeRange(
 """Strides can be told apart in four seconds; over a whole walk they run together."""
 
 
-def walk_layout(robots: Sequence[str], titles: dict[str, str]) -> rrb.Blueprint:
+def walk_layout(robots: Sequence[str], plots: Mapping[str, Plot]) -> rrb.Blueprint:
     """Lay out a recording of walks.
 
     Args:
         robots: their entities' names below `world` and `plot`, from left to right; the camera follows the middle one.
-        titles: title of each plot, by its entity's name below `plot/<robot>`.
+        plots: what there is to see of each, by its entity's name below `plot/<robot>`.
     """
 
-    def plot(name: str, *shown: str, whole: bool = False) -> rrb.TimeSeriesView:
+    def view(name: str, shown: Sequence[str]) -> rrb.TimeSeriesView:
         return rrb.TimeSeriesView(
-            name=titles[name],
+            name=plots[name].title,
             origin="/plot",
             contents=[f"+ /plot/{robot}/{name}/**" for robot in shown]
             + [f"- /plot/{robot}/{name}/command" for robot in shown[1:]],  # it would be drawn over the first one's
             plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop),
-            time_ranges=None if whole else AROUND_THE_CURSOR,
-            axis_y=rrb.ScalarAxis(range=(0.0, 1.5)) if name == "cost_of_transport" else None,  # a start costs far more
+            time_ranges=None if plots[name].row in SHARED else AROUND_THE_CURSOR,
+            axis_y=rrb.ScalarAxis(range=(0.0, 1.5)) if plots[name].row == "cost" else None,  # a start costs far more
         )
+
+    def row(kind: Row, *shown: str) -> rrb.TimeSeriesView | rrb.Tabs:
+        views = [view(name, shown) for name, plot in plots.items() if plot.row == kind]
+        return views[0] if len(views) == 1 else rrb.Tabs(*views)
 
     def details(robot: str, name: str | None = None) -> rrb.Vertical:
-        return rrb.Vertical(
-            plot("gait", robot),
-            rrb.Tabs(*(plot(joint, robot) for joint in ("hip_pitch", "knee", "hip_roll"))),
-            rrb.Tabs(*(plot(effort, robot) for effort in ("power", "torque", "knee_force"))),
-            plot("reward", robot),
-            name=name,
-            row_shares=[3, 2, 2, 2],
-        )
+        rows = [row(kind, robot) for kind in ("gait", "joints", "effort", "reward")]
+        return rrb.Vertical(*rows, name=name, row_shares=[3, 2, 2, 2])
 
-    motion = rrb.Tabs(
-        plot("speed", *robots, whole=True), plot("side_speed", *robots, whole=True), plot("yaw_rate", *robots, whole=True)
-    )
     below = details(robots[0]) if len(robots) == 1 else rrb.Tabs(*(details(robot, robot.replace("_", " ")) for robot in robots))
-    series = rrb.Vertical(motion, plot("cost_of_transport", *robots, whole=True), below, row_shares=[2, 2, 9])
+    series = rrb.Vertical(row("motion", *robots), row("cost", *robots), below, row_shares=[2, 2, 9])
     return rrb.Blueprint(
         rrb.Horizontal(robots_view(f"/world/{robots[len(robots) // 2]}/trunk", len(robots)), series, column_shares=[3, 2]),
         rrb.TimePanel(timeline="time", play_state="playing", loop_mode="all", state="collapsed"),

@@ -1,5 +1,6 @@
 """Pictures of the documentation: the robot with its joints named, the control loop, a second of walking, learning curves."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -11,9 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from telebip.config import TaskConfig
 from telebip.eval.plots import COLORS, STYLE
-from telebip.mdp.observations import LAYOUT
-from telebip.mdp.rewards import REWARDS
-from telebip.robot import JOINTS, Robot
+from telebip.robot import Robot
 from telebip.viz.render import Array, Renderer
 from telebip.viz.scene import Actor
 from telebip.viz.series import plots
@@ -30,7 +29,7 @@ LEARNING = {
 
 
 def draw_robot(robot: Robot, size: tuple[int, int] = (1000, 720)) -> Image.Image:
-    """Draw the robot in its home pose, with the axis, name, range and force limit of each joint.
+    """Draw telebip's robot in its home pose, with the axis, name, range and force limit of each joint.
 
     Raises:
         UserError: there is no OpenGL to render with.
@@ -39,7 +38,7 @@ def draw_robot(robot: Robot, size: tuple[int, int] = (1000, 720)) -> Image.Image
     with Renderer(robot, (scale * size[0], scale * size[1]), extent=1.5) as renderer:
         renderer.look_at([0.0, 0.0, 0.42], distance=1.4, azimuth=161.0, elevation=-20.0)
         renderer.place([robot.home_qpos])
-        tips = np.array([_draw_axis(renderer, joint) for joint in JOINTS])
+        tips = np.array([_draw_axis(renderer, joint) for joint in robot.joint_names])
         corner = np.array([-0.02, -0.36, 0.004])
         for direction in np.eye(3):
             renderer.arrow(corner, corner + 0.14 * direction, INK, radius=0.004)
@@ -50,10 +49,10 @@ def draw_robot(robot: Robot, size: tuple[int, int] = (1000, 720)) -> Image.Image
     for text, (x, y) in zip(("x forward", "y left", "z up"), frame_places, strict=True):
         draw.text((x, y), text, fill=INK, font=font, anchor="mm")
     rows = {"hip_pitch": 0.26, "hip_roll": 0.42, "knee": 0.66}
-    for i, joint in enumerate(JOINTS):
+    for i, joint in enumerate(robot.joint_names):
         side, _, kind = joint.partition("_")
         (low, high), limit = robot.joint_range[i], robot.force_limit[i]
-        units = ("m", "N") if kind == "knee" else ("rad", "N m")
+        units = ("m", "N") if robot.is_slide[i] else ("rad", "N m")
         x, y = picture.width * (0.03 if side == "right" else 0.97), picture.height * rows[kind]
         anchor, inner = ("l", x + 190 * scale) if side == "right" else ("r", x - 190 * scale)
         draw.line([(inner, y), tuple(joint_places[i])], fill=AXIS_COLORS[kind], width=scale)
@@ -78,8 +77,8 @@ def _draw_axis(renderer: Renderer, joint: str) -> Array:
     return tip
 
 
-def draw_control_loop(config: TaskConfig, robot: Robot) -> Figure:
-    """Draw what happens in one policy step, with the rates and sizes of the task."""
+def draw_control_loop(config: TaskConfig, robot: Robot, observation: Mapping[str, int]) -> Figure:
+    """Draw what happens in one policy step, with the rates of the task and the size of each term of its `observation`."""
     policy_hz = 1.0 / (config.sim.decimation * robot.physics_dt)
     physics_hz = 1.0 / robot.physics_dt
     figure, axes = plt.subplots(figsize=(9.6, 3.7))
@@ -102,29 +101,30 @@ def draw_control_loop(config: TaskConfig, robot: Robot) -> Figure:
     axes.text(2, 33.5, f"policy step: {policy_hz:.0f} Hz", fontsize=10, fontweight="bold", va="center")
     title = f"physics: {physics_hz:.0f} Hz, {config.sim.decimation} steps of {1e3 * robot.physics_dt:g} ms"
     axes.text(57.5, 28.5, title, fontsize=10, fontweight="bold", va="center")
-    sizes = [f"{name.replace('_', ' ')} {size}" for name, size in LAYOUT.items()]
-    observation = "\n".join(", ".join(sizes[i : i + 2]) for i in range(0, len(sizes), 2))
-    box(2, 12.5, 28, 13.5, f"observation ({sum(LAYOUT.values())})\n{observation}", "#fbe3cf")
+    sizes = [f"{name.replace('_', ' ')} {size}" for name, size in observation.items()]
+    lines = [", ".join(sizes[i : i + 2]) for i in range(0, len(sizes), 2)]
+    box(2, 12.5, 28, 13.5, "\n".join([f"observation ({sum(observation.values())})", *lines]), "#fbe3cf")
     layers = "-".join(str(size) for size in config.ppo.hidden_dims)
     box(34.5, 12.5, 13, 13.5, f"policy\n{layers}\n{config.ppo.activation.upper()}", "#cfe0f2")
     box(58, 12.5, 17, 13.5, "PD actuators\nkp (q* - q) - kv $\\dot{q}$\nforce limits", "#ffffff")
     box(81.5, 12.5, 11.5, 13.5, "robot\nand\nground", "#ffffff")
     arrow([(30, 19.2), (34.5, 19.2)])
-    arrow([(47.5, 19.2), (58, 19.2)], "6 joint\ntargets q*", (51.7, 22.6))
+    arrow([(47.5, 19.2), (58, 19.2)], f"{len(robot.joint_names)} joint\ntargets q*", (51.7, 22.6))
     arrow([(75, 21), (81.5, 21)], "forces", (78.2, 22.7))
     arrow([(81.5, 17), (75, 17)], "q, $\\dot{q}$", (78.2, 15.3))
     arrow([(87, 12.5), (87, 6), (16, 6), (16, 12.5)], "state; means of forces and power over the step", (51, 7.7))
-    axes.text(51, 4.1, f"rewards in training: {', '.join(REWARDS)}", ha="center", va="center", fontsize=8.5, color="#3b414c")
+    rewards = f"rewards in training: {', '.join(config.rewards)}"
+    axes.text(51, 4.1, rewards, ha="center", va="center", fontsize=8.5, color="#3b414c")
     arrow([(16, 31), (16, 26)], "command vx, vy, yaw rate; phase p_r, p_l", (33, 29.3))
     return figure
 
 
-def draw_stride(actor: Actor, seconds: float = 1.5) -> Figure:
-    """Plot the last `seconds` of a walk: speed, feet, knees, hips, power."""
+def draw_stride(actor: Actor, robot: Robot, seconds: float = 1.5) -> Figure:
+    """Plot the last `seconds` of a walk of telebip's robot: speed, feet, knees, hips, power."""
     rollout = actor.rollout
     rows = slice(-round(seconds / rollout.step_dt), None)
     time = rollout.time[rows] - rollout.time[rows][0]
-    shown = plots(rollout, actor.world)
+    shown = plots(rollout, actor.world, robot.is_slide)
     with plt.rc_context(STYLE):
         names = ("speed", "gait", "hip_pitch", "knee", "power", "reward")
         figure, grid = plt.subplots(3, 2, figsize=(9.6, 6.0), sharex=True, layout="constrained")

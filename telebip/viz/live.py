@@ -4,18 +4,17 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 import rerun as rr
 import torch
 
-from telebip.config import load_task
 from telebip.env import TelebipEnv
-from telebip.eval.rollout import roll_out
-from telebip.rl.checkpoint import Checkpoint
+from telebip.eval.conditions import as_evaluated
 from telebip.rl.policy import load_policy
 from telebip.rl.train import Trainer
+from telebip.rollout import roll_out
 from telebip.viz.blueprint import training_layout
 from telebip.viz.rerun import log_mesh, viewer
 from telebip.viz.scene import LANE
@@ -57,9 +56,9 @@ class LiveView:
         """Log the robots' shapes and start the thread; `budget` is the share of the time that may be taken."""
         self._trainer, self._stream, self._budget = trainer, stream, budget
         self._start, self._spent, self._played = time.perf_counter(), 0.0, 0.0  # [s], the last two by either thread
-        own = [f"num_envs={WORLDS}", f"episode.length={SECONDS + 1.0}", "episode.reset_heading=0"]
-        self._env = TelebipEnv(load_task(trainer.env.cfg, own), trainer.env.robot, "cpu", "native")
-        self._urdf = load_urdf(trainer.env.robot.path.with_suffix(".urdf"))
+        cfg, robot = as_evaluated(trainer.env.cfg, WORLDS, SECONDS, disturbed=True), trainer.env.robot
+        self._env = TelebipEnv(replace(cfg, observations={"policy": cfg.observations["policy"]}), robot, "cpu", "native")
+        self._urdf = load_urdf(robot)
         stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         for link in self._urdf.link_map:
             log_mesh(stream, f"world/{link}", self._urdf, link)
@@ -85,17 +84,14 @@ class LiveView:
 
     def _walk(self) -> None:
         trainer, env = self._trainer, self._env
-        actor = {name: value.cpu() for name, value in trainer.learner.get_policy().state_dict().items()}
-        now = Checkpoint(Path("live"), trainer.task, env.cfg, trainer.iteration, trainer.samples, {"actor_state_dict": actor})
-        env.set_progress(trainer.samples)
-        with torch.inference_mode():
-            env.reset()
+        env.set_samples(trainer.samples)
+        env.reset()
         with torch.random.fork_rng(devices=[]):  # new networks draw weights before they are given the learner's
-            policy = load_policy(now, "cpu")
+            policy = load_policy(trainer.policy(), "cpu")
         rollout = roll_out(env, policy, round(SECONDS / env.step_dt))
         qpos = rollout.qpos[::FRAME_STEPS].astype(float)
         qpos[..., 1] += LANE * (0.5 * (WORLDS - 1) - np.arange(WORLDS))
-        poses = link_poses(self._urdf, qpos.reshape(-1, 13))
+        poses = link_poses(self._urdf, env.robot, qpos.reshape(-1, qpos.shape[-1]))
         frames = {link: pose.reshape(len(qpos), WORLDS, 4, 4) for link, pose in poses.items()}
         self._frames = [{link: _poses(pose[i]) for link, pose in frames.items()} for i in range(len(qpos))]
 

@@ -64,7 +64,7 @@ class Renderer:
         self.camera.distance, self.camera.azimuth, self.camera.elevation = distance, azimuth, elevation
 
     def place(self, poses: Sequence[Array]) -> Array:
-        """Start a scene: the floor, and a robot for every row of qpos (13) in `poses`; return their feet [m], (n, 2, 3)."""
+        """Start a scene: the floor, and a robot for every row of qpos (nq) in `poses`; return their feet [m], (n, 2, 3)."""
         feet = []
         for i, qpos in enumerate(poses):
             self.data.qpos[:] = qpos

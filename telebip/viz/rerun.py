@@ -1,58 +1,60 @@
+# pyright: reportAttributeAccessIssue=false
 """Recordings of walks for the rerun viewer: the robots in 3D beside their time series, logged in columns."""
 
 import re
 import socket
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from urllib.parse import urlsplit
 
+import mujoco
 import numpy as np
 import rerun as rr
 import yourdfpy
 from rerun.blueprint import Blueprint
 
 from telebip.errors import UserError
-from telebip.robot import FEET, TRUNK
+from telebip.robot import FEET, FOOT_SENSORS, TRUNK, Robot
 from telebip.viz.blueprint import walk_layout
 from telebip.viz.opengl import has_display
 from telebip.viz.scene import ACTUAL, COMMAND, FORCE_SCALE, GROUND_FORCE, PUSH, PUSH_SCALE, SPEED_SCALE, Actor, Color
-from telebip.viz.series import PALETTE, SHARED, TOTAL, plots
-from telebip.viz.urdf import Array, joint_transforms, link_mesh, link_paths, link_poses, load_urdf
+from telebip.viz.series import PALETTE, SHARED, TOTAL, Plot, plots
+from telebip.viz.urdf import Array, joint_transforms, link_mesh, link_paths, load_urdf, rotation_matrices
 
 
-def record(actors: Sequence[Actor], urdf: Path, file: Path) -> None:
+def record(actors: Sequence[Actor], robot: Robot, file: Path) -> None:
     """Write walks to a `.rrd` file, with a prepared layout.
 
     Args:
         actors: who walked, from `telebip.viz.scene.line_up`.
-        urdf: the robot; its joints carry the names of `telebip.robot.JOINTS`.
+        robot: their model; its URDF stands beside its MJCF, see `telebip.viz.urdf.load_urdf`.
         file: where to write; its folder is made.
 
     Raises:
         UserError: the file cannot be written, or the URDF is missing or has shapes that cannot be drawn.
     """
-    robot = load_urdf(urdf)
+    urdf = load_urdf(robot)
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         file.open("wb").close()  # rerun writes in a thread of its own and would only log a failure
     except OSError as error:
         raise UserError(f"cannot write recording '{file}': {error.strerror or error}") from error
     stream = rr.RecordingStream("telebip", recording_id=file.stem)
-    stream.save(file, default_blueprint=_layout(actors))
-    log_walks(stream, actors, robot)
+    stream.save(file, default_blueprint=_layout(actors, robot))
+    log_walks(stream, actors, robot, urdf)
     stream.disconnect()
 
 
-def show(actors: Sequence[Actor], urdf: Path, address: str | None = None) -> None:
+def show(actors: Sequence[Actor], robot: Robot, address: str | None = None) -> None:
     """Show walks in a rerun viewer: in the one at `address`, or else in one on this machine, started if there is none.
 
     Raises:
         UserError: as `record`, or there is no viewer at `address`, or no display for one here.
     """
-    robot = load_urdf(urdf)
-    with viewer(_layout(actors), address) as stream:
-        log_walks(stream, actors, robot)
+    urdf = load_urdf(robot)
+    with viewer(_layout(actors, robot), address) as stream:
+        log_walks(stream, actors, robot, urdf)
 
 
 @contextmanager
@@ -97,16 +99,17 @@ def _url(address: str) -> str:
     return address if "://" in address else f"rerun+http://{address}/proxy"
 
 
-def log_walks(stream: rr.RecordingStream, actors: Sequence[Actor], robot: yourdfpy.URDF) -> None:
+def log_walks(stream: rr.RecordingStream, actors: Sequence[Actor], robot: Robot, urdf: yourdfpy.URDF) -> None:
     """Log robots below `world/<name>`, and their series below `plot/<name>`."""
     stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     several = len(actors) > 1
     for i, (name, actor) in enumerate(zip(names(actors), actors, strict=True)):
         time = rr.TimeColumn("time", duration=actor.rollout.time)
-        _log_shape(stream, robot, f"world/{name}", actor, several)
-        _log_motion(stream, robot, f"world/{name}", actor, time)
+        _log_shape(stream, urdf, f"world/{name}", actor, several)
+        _log_motion(stream, urdf, robot, f"world/{name}", actor, time)
         _log_arrows(stream, robot, f"world/{name}", actor, time)
-        _log_series(stream, f"plot/{name}", actor, time, PALETTE[i % len(PALETTE)], several)
+        own = PALETTE[i % len(PALETTE)] if several else None
+        _log_series(stream, plots(actor.rollout, actor.world, robot.is_slide), f"plot/{name}", actor.label, time, own)
 
 
 def names(actors: Sequence[Actor]) -> list[str]:
@@ -118,9 +121,9 @@ def names(actors: Sequence[Actor]) -> list[str]:
     return found
 
 
-def log_mesh(stream: rr.RecordingStream, path: str, robot: yourdfpy.URDF, link: str) -> None:
+def log_mesh(stream: rr.RecordingStream, path: str, urdf: yourdfpy.URDF, link: str) -> None:
     """Log the shape of a link, if it has one."""
-    mesh = link_mesh(robot, link)
+    mesh = link_mesh(urdf, link)
     if mesh is not None:
         shape = rr.Mesh3D(
             vertex_positions=mesh.vertices,
@@ -131,27 +134,29 @@ def log_mesh(stream: rr.RecordingStream, path: str, robot: yourdfpy.URDF, link: 
         stream.log(path, shape, static=True)
 
 
-def _log_shape(stream: rr.RecordingStream, robot: yourdfpy.URDF, root: str, actor: Actor, several: bool) -> None:
+def _log_shape(stream: rr.RecordingStream, urdf: yourdfpy.URDF, root: str, actor: Actor, several: bool) -> None:
     stream.log(root, rr.Transform3D(translation=[0.0, actor.lane, 0.0]), static=True)
-    for link, path in link_paths(robot).items():
-        log_mesh(stream, f"{root}/{path}", robot, link)
+    for link, path in link_paths(urdf).items():
+        log_mesh(stream, f"{root}/{path}", urdf, link)
     if several:
         label = rr.Points3D([[0.0, 0.0, 0.4]], radii=0.005, colors=[250, 250, 250], labels=[actor.label], show_labels=True)
         stream.log(f"{root}/{TRUNK}/label", label, static=True)
 
 
-def _log_motion(stream: rr.RecordingStream, robot: yourdfpy.URDF, root: str, actor: Actor, time: rr.TimeColumn) -> None:
+def _log_motion(
+    stream: rr.RecordingStream, urdf: yourdfpy.URDF, robot: Robot, root: str, actor: Actor, time: rr.TimeColumn
+) -> None:
     """Log the trunk's pose in the lane, and every link's in its parent's."""
-    qpos, paths = actor.rollout.qpos[:, actor.world], link_paths(robot)
+    qpos, paths = actor.rollout.qpos[:, actor.world], link_paths(urdf)
     quat_xyzw = np.roll(qpos[:, 3:7], -1, axis=1)
     trunk = rr.Transform3D.columns(translation=qpos[:, :3], quaternion=quat_xyzw)
     stream.send_columns(f"{root}/{TRUNK}", indexes=[time], columns=trunk)
-    for link, pose in joint_transforms(robot, qpos[:, 7:]).items():
+    for link, pose in joint_transforms(urdf, robot, qpos).items():
         columns = rr.Transform3D.columns(translation=pose[:, :3, 3], mat3x3=pose[:, :3, :3])
         stream.send_columns(f"{root}/{paths[link]}", indexes=[time], columns=columns)
 
 
-def _log_arrows(stream: rr.RecordingStream, robot: yourdfpy.URDF, root: str, actor: Actor, time: rr.TimeColumn) -> None:
+def _log_arrows(stream: rr.RecordingStream, robot: Robot, root: str, actor: Actor, time: rr.TimeColumn) -> None:
     """Log ground forces at the feet, the push on the trunk, and above it the commanded and the actual velocity."""
     rollout, world = actor.rollout, actor.world
     qpos, up = rollout.qpos[:, world], np.array([0.0, 0.0, 1.0])
@@ -162,12 +167,12 @@ def _log_arrows(stream: rr.RecordingStream, robot: yourdfpy.URDF, root: str, act
         columns = rr.Arrows3D.columns(origins=origins, vectors=vectors)
         stream.send_columns(f"{root}/{path}", indexes=[time], columns=columns)
 
-    poses = link_poses(robot, qpos)
+    feet = _foot_positions(robot, qpos)
     for i, foot in enumerate(FEET):
         force = FORCE_SCALE * rollout.foot_force[:, world, i, None] * up
-        arrows(f"ground_force/{foot}", poses[foot][:, :3, 3], force, GROUND_FORCE, radius=0.022)  # thicker than the shank
+        arrows(f"ground_force/{foot}", feet[:, i], force, GROUND_FORCE, radius=0.022)  # thicker than the shank
     arrows("push", trunk + 0.1 * up, PUSH_SCALE * rollout.push_w[:, world], PUSH)
-    forward = poses[TRUNK][:, :2, 0]
+    forward = rotation_matrices(qpos[:, 3:7])[:, :2, 0]
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
     command = rollout.command[:, world]
     wanted = np.zeros((len(qpos), 3))
@@ -178,16 +183,29 @@ def _log_arrows(stream: rr.RecordingStream, robot: yourdfpy.URDF, root: str, act
     arrows("velocity/actual", trunk + 0.27 * up, SPEED_SCALE * actual, ACTUAL)
 
 
-def _log_series(stream: rr.RecordingStream, root: str, actor: Actor, time: rr.TimeColumn, own: Color, several: bool) -> None:
-    """Log the plots; curves that `several` robots share a plot with tell whose they are, by name and by its `own` colour."""
-    for name, plot in plots(actor.rollout, actor.world).items():
+def _foot_positions(robot: Robot, qpos: Array) -> Array:
+    """Return where the feet's touch sensors are in the world [m], (steps, 2, 3), for rows of `qpos` (steps, nq)."""
+    data, sites = mujoco.MjData(robot.model), [int(robot.model.sensor(name).objid[0]) for name in FOOT_SENSORS]
+    feet = []
+    for row in qpos:
+        data.qpos[:] = row
+        mujoco.mj_kinematics(robot.model, data)
+        feet.append(data.site_xpos[sites])  # a copy
+    return np.array(feet)
+
+
+def _log_series(
+    stream: rr.RecordingStream, shown: Mapping[str, Plot], root: str, label: str, time: rr.TimeColumn, own: Color | None
+) -> None:
+    """Log plots; curves that several robots share a plot with tell whose they are, by name and by each one's `own` colour."""
+    for name, plot in shown.items():
         for curve_name, curve in plot.curves.items():
-            path, color = f"{root}/{name}/{curve_name}", own if curve.color == TOTAL else curve.color
-            shown = f"{actor.label}: {curve_name}" if several and name in SHARED and curve_name != "command" else curve_name
-            stream.log(path, rr.SeriesLines(colors=[color], names=[shown], widths=[curve.width]), static=True)
+            path, color = f"{root}/{name}/{curve_name}", own if own and curve.color == TOTAL else curve.color
+            is_shared = own and plot.row in SHARED and curve_name != "command"
+            title = f"{label}: {curve_name}" if is_shared else curve_name
+            stream.log(path, rr.SeriesLines(colors=[color], names=[title], widths=[curve.width]), static=True)
             stream.send_columns(path, indexes=[time], columns=rr.Scalars.columns(scalars=curve.values))
 
 
-def _layout(actors: Sequence[Actor]) -> Blueprint:
-    titles = {name: plot.title for name, plot in plots(actors[0].rollout, actors[0].world).items()}
-    return walk_layout(names(actors), titles)
+def _layout(actors: Sequence[Actor], robot: Robot) -> Blueprint:
+    return walk_layout(names(actors), plots(actors[0].rollout, actors[0].world, robot.is_slide))

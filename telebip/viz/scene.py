@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from telebip.eval.rollout import Rollout
+from telebip.rollout import Rollout
 
 LANE = 0.9  # m between robots side by side
 

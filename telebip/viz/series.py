@@ -1,13 +1,14 @@
 """What is plotted of a walk: its time series, grouped into plots, with their colours."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from telebip.eval.rollout import Rollout
 from telebip.eval.walk import heading_velocity
-from telebip.robot import FEET, JOINTS
+from telebip.robot import FEET
+from telebip.rollout import Rollout
 from telebip.viz.scene import Color
 
 Array = NDArray[np.floating]
@@ -15,9 +16,16 @@ Array = NDArray[np.floating]
 RIGHT, LEFT, COMMAND, TOTAL = (235, 110, 80), (80, 160, 235), (170, 170, 170), (240, 200, 80)
 PALETTE: tuple[Color, ...] = (TOTAL, (90, 200, 130), (80, 160, 235), (235, 110, 80), (190, 120, 220), (140, 220, 220))
 """Colours of robots, and of terms, in turn."""
+SHADES: dict[str, tuple[Color, ...]] = {
+    "right": (RIGHT, (250, 180, 90), (215, 90, 150), (190, 150, 60)),
+    "left": (LEFT, (110, 220, 210), (130, 120, 235), (70, 190, 130)),
+    "": PALETTE,
+}
+"""Colours of the joints of a side, or of none, in turn."""
 
-SHARED = ("speed", "side_speed", "yaw_rate", "cost_of_transport")
-"""Plots in which several robots are compared."""
+Row = Literal["motion", "cost", "gait", "joints", "effort", "reward"]
+SHARED: tuple[Row, ...] = ("motion", "cost")
+"""Rows in whose plots several robots are compared."""
 
 
 @dataclass(frozen=True)
@@ -33,55 +41,75 @@ class Curve:
 class Plot:
     """Curves that share their axes."""
 
+    row: Row  # of a recording's layout; the plots of a row are its tabs
     title: str  # with the unit
     curves: dict[str, Curve]
 
 
-def plots(rollout: Rollout, world: int) -> dict[str, Plot]:
-    """Return the plots of one world, by the names under which a recording keeps them."""
+def plots(rollout: Rollout, world: int, is_slide: NDArray[np.bool_]) -> dict[str, Plot]:
+    """Return the plots of one world, by the names under which a recording keeps them.
+
+    Joints share a plot with those of the other side: `right_knee` and `left_knee` are curves of `knee`.
+
+    Args:
+        rollout: what happened.
+        world: index of the world.
+        is_slide: `Robot.is_slide`.
+    """
     velocity = heading_velocity(rollout.qpos[:, world], rollout.qvel[:, world])
     command, power = rollout.command[:, world], rollout.joint_power[:, world].sum(-1)
     yaw_rate = rollout.qvel[:, world, 5]
     phase, load = rollout.phase[:, world], rollout.foot_force[:, world] / rollout.weight
-    position, target = rollout.qpos[:, world, 7:], rollout.joint_target[:, world]
-    force, colors = rollout.joint_force[:, world], (RIGHT, LEFT)
     running = running_cost_of_transport(power, velocity, rollout.weight, round(1.0 / rollout.step_dt))
 
     def pair(values: Array, names: tuple[str, str], width: float = 1.5) -> dict[str, Curve]:
-        return {name: Curve(values[:, i], colors[i], width) for i, name in enumerate(names)}
+        return {name: Curve(values[:, i], (RIGHT, LEFT)[i], width) for i, name in enumerate(names)}
 
-    def joint(kind: str) -> Plot:
-        unit = "m" if kind == "knee" else "rad"
-        rows = [i for i, name in enumerate(JOINTS) if name.endswith(kind)]
-        sides = pair(position[:, rows], ("right", "left"))
-        return Plot(f"{kind.replace('_', ' ')} [{unit}]", sides | pair(target[:, rows], ("right_target", "left_target"), 0.7))
+    def against(command: Array, name: str, values: Array) -> dict[str, Curve]:
+        return {"command": Curve(command, COMMAND), name: Curve(values, TOTAL)}
 
-    hips = [i for i, name in enumerate(JOINTS) if not name.endswith("knee")]
-    knees = [i for i, name in enumerate(JOINTS) if name.endswith("knee")]
-    shades = ((235, 110, 80), (250, 180, 90), (80, 160, 235), (110, 220, 210))
     terms = zip(rollout.reward_names, rollout.reward_terms[:, world].T, strict=True)
+    rewards = {name: Curve(values, PALETTE[1 + i % 5]) for i, (name, values) in enumerate(terms)}
     return {
-        "speed": Plot("speed [m/s]", {"command": Curve(command[:, 0], COMMAND), "forward": Curve(velocity[:, 0], TOTAL)}),
-        "side_speed": Plot(
-            "speed to the left [m/s]", {"command": Curve(command[:, 1], COMMAND), "left": Curve(velocity[:, 1], TOTAL)}
-        ),
-        "yaw_rate": Plot("yaw rate [rad/s]", {"command": Curve(command[:, 2], COMMAND), "trunk": Curve(yaw_rate, TOTAL)}),
-        "gait": Plot("phase, foot force / weight", pair(phase, ("p_r", "p_l"), 0.7) | pair(load, FEET)),
-        "hip_pitch": joint("hip_pitch"),
-        "hip_roll": joint("hip_roll"),
-        "knee": joint("knee"),
-        "torque": Plot("hip torque [N m]", {JOINTS[i]: Curve(force[:, i], shades[k]) for k, i in enumerate(hips)}),
-        "knee_force": Plot("knee force [N]", pair(force[:, knees], ("right", "left"))),
-        "power": Plot("power [W]", {"total": Curve(power, TOTAL)}),
-        "cost_of_transport": Plot("cost of transport, last second", {"mechanical": Curve(running, TOTAL)}),
-        "reward": Plot(
-            "reward per step",
-            {
-                **{name: Curve(values, PALETTE[1 + i % 5]) for i, (name, values) in enumerate(terms)},
-                "total": Curve(rollout.reward[:, world], TOTAL),
-            },
-        ),
+        "speed": Plot("motion", "speed [m/s]", against(command[:, 0], "forward", velocity[:, 0])),
+        "side_speed": Plot("motion", "speed to the left [m/s]", against(command[:, 1], "left", velocity[:, 1])),
+        "yaw_rate": Plot("motion", "yaw rate [rad/s]", against(command[:, 2], "trunk", yaw_rate)),
+        "cost_of_transport": Plot("cost", "cost of transport, last second", {"mechanical": Curve(running, TOTAL)}),
+        "gait": Plot("gait", "phase, foot force / weight", pair(phase, ("p_r", "p_l"), 0.7) | pair(load, FEET)),
+        **_joint_plots(rollout, world, is_slide),
+        "power": Plot("effort", "power [W]", {"total": Curve(power, TOTAL)}),
+        **_effort_plots(rollout, world, is_slide),
+        "reward": Plot("reward", "reward per step", {**rewards, "total": Curve(rollout.reward[:, world], TOTAL)}),
     }
+
+
+def _joint_plots(rollout: Rollout, world: int, is_slide: NDArray[np.bool_]) -> dict[str, Plot]:
+    """Return positions and targets of the joints, in a plot for each pair."""
+    found: dict[str, Plot] = {}
+    for i, name in enumerate(rollout.joint_names):
+        side, kind = split_side(name)
+        title = f"{kind.replace('_', ' ')} [{'m' if is_slide[i] else 'rad'}]"
+        curves = found.setdefault(kind, Plot("joints", title, {})).curves
+        curves[side or "position"] = Curve(rollout.joint_pos[:, world, i], SHADES[side][0])
+        curves[f"{side}_target".strip("_")] = Curve(rollout.joint_target[:, world, i], SHADES[side][0], 0.7)
+    return found
+
+
+def _effort_plots(rollout: Rollout, world: int, is_slide: NDArray[np.bool_]) -> dict[str, Plot]:
+    """Return the torques of all hinges in one plot, and the forces of all slides in another."""
+    plots = {"torque": Plot("effort", "joint torque [N m]", {}), "force": Plot("effort", "joint force [N]", {})}
+    for i, name in enumerate(rollout.joint_names):
+        curves = plots["force" if is_slide[i] else "torque"].curves
+        side, _ = split_side(name)
+        shade = sum(split_side(other)[0] == side for other in curves)
+        curves[name] = Curve(rollout.joint_force[:, world, i], SHADES[side][shade % len(SHADES[side])])
+    return {name: plot for name, plot in plots.items() if plot.curves}
+
+
+def split_side(joint: str) -> tuple[str, str]:
+    """Return a joint's side, `right`, `left` or nothing, and the rest of its name: ("right", "knee") of `right_knee`."""
+    side, _, kind = joint.partition("_")
+    return (side, kind) if side in ("right", "left") and kind else ("", joint)
 
 
 def running_cost_of_transport(power: Array, velocity: Array, weight: float, window: int, slowest: float = 0.05) -> Array:

@@ -1,7 +1,6 @@
 """The robot as its URDF draws it, read through yourdfpy: one coloured mesh per link, and where the links are."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import trimesh
@@ -9,7 +8,7 @@ import yourdfpy
 from numpy.typing import NDArray
 
 from telebip.errors import UserError, nearest
-from telebip.robot import JOINTS, TRUNK
+from telebip.robot import TRUNK, Robot
 
 Array = NDArray[np.floating]
 GREY = (0.7, 0.7, 0.7, 1.0)
@@ -25,19 +24,21 @@ class Mesh:
     colors: NDArray[np.uint8]  # (n, 4), RGBA
 
 
-def load_urdf(path: Path) -> yourdfpy.URDF:
-    """Load a robot whose joints carry the names of `telebip.robot.JOINTS`.
+def load_urdf(robot: Robot) -> yourdfpy.URDF:
+    """Load the URDF that stands beside a robot's MJCF, with the same names of joints.
 
     Raises:
-        UserError: the file is missing or is no URDF, or the trunk or a joint is missing.
+        UserError: the file is missing or is no URDF, or the trunk or an actuated joint is missing.
     """
+    path = robot.path.with_suffix(".urdf")
     if not path.is_file():
         raise UserError(f"drawing the robot takes its URDF, but '{path}' does not exist")
     try:
         urdf = yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False)
     except Exception as error:  # yourdfpy lets through whatever the XML parser and its own converters raise
         raise UserError(f"'{path}' is not a valid URDF: {error}") from error
-    for kind, name, known in (("link", TRUNK, urdf.link_map), *(("joint", joint, urdf.joint_map) for joint in JOINTS)):
+    joints = (("joint", name, urdf.joint_map) for name in robot.joint_names)
+    for kind, name, known in (("link", TRUNK, urdf.link_map), *joints):
         if name not in known:
             raise UserError(f"{path}: no {kind} named '{name}'; {nearest(name, known)}")
     return urdf
@@ -79,24 +80,26 @@ def link_mesh(urdf: yourdfpy.URDF, link: str) -> Mesh | None:
     )
 
 
-def joint_transforms(urdf: yourdfpy.URDF, joint_pos: Array) -> dict[str, Array]:
+def joint_transforms(urdf: yourdfpy.URDF, robot: Robot, qpos: Array) -> dict[str, Array]:
     r"""Return the pose of every link in its parent's frame, T = T_origin(joint) M(q), by the child's name.
 
     M(q) slides by q along the axis of a prismatic joint and turns by q about the axis u of a revolute one (Rodrigues):
-    R = 1 + sin(q) [u]x + (1 - cos(q)) [u]x^2. Joints that are not in `JOINTS` stay at zero.
+    R = 1 + sin(q) [u]x + (1 - cos(q)) [u]x^2. Joints that only the URDF has stay at zero.
 
     Args:
-        urdf: the robot.
-        joint_pos: positions in the order of `JOINTS` [rad | m], (steps, 6).
+        urdf: from `load_urdf`.
+        robot: what the columns of `qpos` are.
+        qpos: positions, (steps, nq).
 
     Returns:
         Homogeneous matrices, (steps, 4, 4) each.
     """
+    columns = {robot.model.joint(i).name: int(robot.model.jnt_qposadr[i]) for i in range(1, robot.model.njnt)}
     transforms = {}
     for joint in urdf.robot.joints:
-        motion = np.tile(np.eye(4), (len(joint_pos), 1, 1))
-        if joint.name in JOINTS:
-            q = joint_pos[:, JOINTS.index(joint.name)].astype(float)
+        motion = np.tile(np.eye(4), (len(qpos), 1, 1))
+        if joint.name in columns:
+            q = qpos[:, columns[joint.name]].astype(float)
             axis = np.asarray(joint.axis, dtype=float)
             if joint.type == "prismatic":
                 motion[:, :3, 3] = q[:, None] * axis
@@ -108,12 +111,12 @@ def joint_transforms(urdf: yourdfpy.URDF, joint_pos: Array) -> dict[str, Array]:
     return transforms
 
 
-def link_poses(urdf: yourdfpy.URDF, qpos: Array) -> dict[str, Array]:
-    """Return the pose of every link in the world, as homogeneous matrices (steps, 4, 4), for rows of `qpos` (steps, 13)."""
+def link_poses(urdf: yourdfpy.URDF, robot: Robot, qpos: Array) -> dict[str, Array]:
+    """Return the pose of every link in the world, as homogeneous matrices (steps, 4, 4); arguments as of `joint_transforms`."""
     base = np.tile(np.eye(4), (len(qpos), 1, 1))
     base[:, :3, :3] = rotation_matrices(qpos[:, 3:7])
     base[:, :3, 3] = qpos[:, :3]
-    relative, poses = joint_transforms(urdf, qpos[:, 7:]), {TRUNK: base}
+    relative, poses = joint_transforms(urdf, robot, qpos), {TRUNK: base}
     parents = {joint.child: joint.parent for joint in urdf.robot.joints}
 
     def pose(link: str) -> Array:

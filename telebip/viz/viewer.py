@@ -15,6 +15,7 @@ from telebip.control.policy import Policy
 from telebip.env import TelebipEnv
 from telebip.errors import UserError
 from telebip.eval.walk import cost_of_transport, heading_velocity
+from telebip.rollout import walk
 from telebip.viz.opengl import has_display
 from telebip.viz.scene import PUSH, PUSH_SCALE
 
@@ -30,7 +31,7 @@ class Steering:
     def __init__(self, env: TelebipEnv, policy: Policy) -> None:
         """Start at the environment's present command; random pushes, if there are any, leave no room for the user's."""
         self.env, self.policy = env, policy
-        self.command = env.target_command[0].tolist()  # forward, left, yaw rate [m/s, m/s, rad/s]
+        self.command = env.state.target_command[0].tolist()  # forward, left, yaw rate [m/s, m/s, rad/s]
         self.paused = False
         self.push = 0.0  # to the left [N]
         self._start = list(self.command)
@@ -55,21 +56,19 @@ class Steering:
     def step(self) -> None:
         """Walk on for one policy step, unless paused; after a reset from the start, at the first command."""
         env = self.env
-        with torch.inference_mode():
-            if self._restart:
-                self._restart, self.command, self.push, self._push_left = False, list(self._start), 0.0, 0
-                env.set_command(*self.command)
-                self._obs = env.reset()
-                self.policy.reset(torch.ones(env.num_envs, dtype=torch.bool, device=env.device))
-                self._latest.clear()
-            if self.paused:
-                return
+        if self._restart:
+            self._restart, self.command, self.push, self._push_left = False, list(self._start), 0.0, 0
             env.set_command(*self.command)
-            self.push = self.push if self._push_left else 0.0
-            env.push_wrench_w[:, 1] = self.push
-            self._push_left = max(0, self._push_left - 1)
-            self._obs, _, dones, _ = env.step(self.policy(self._obs))
-            self.policy.reset(dones)
+            env.reset()
+            self._walk = walk(env, self.policy)
+            self._latest.clear()
+        if self.paused:
+            return
+        env.set_command(*self.command)
+        self.push = self.push if self._push_left else 0.0
+        env.push(torch.tensor([0.0, self.push, 0.0]))
+        self._push_left = max(0, self._push_left - 1)
+        next(self._walk)
         state = env.sim.state
         vx, vy = heading_velocity(state.qpos[0].cpu().numpy(), state.qvel[0].cpu().numpy())
         self._latest.append((float(state.joint_power[0].sum()), vx, vy))

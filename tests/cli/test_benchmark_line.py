@@ -8,7 +8,7 @@ import pytest
 from processes import fresh
 from test_commands_line import ran, refusal
 
-from telebip.rl.benchmark import summary
+from telebip.tools.benchmark import summary
 
 BENCHMARK = "scripts/benchmark.py"
 TINY = ("--device", "cpu", "--rounds", "2", "ppo.num_steps_per_env=3")

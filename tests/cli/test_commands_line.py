@@ -1,6 +1,7 @@
 """The scripts as a user runs them: exit status, the one line on standard error, and what they leave."""
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -98,7 +99,7 @@ def test_a_gpu_that_is_not_there() -> None:
     "code",
     [
         "import telebip",
-        "import telebip.config; telebip.config.load_task('telebip_flat')",
+        "import telebip.config; telebip.config.task_names()",
         "import runpy; sys.argv = ['train.py', '--help']; runpy.run_path('scripts/train.py', run_name='__main__')",
     ],
     ids=["telebip", "config", "help"],
@@ -160,8 +161,18 @@ def test_a_model_based_walker_can_be_played() -> None:
     assert "controller 'alip': telebip_flat, 1 world x 1 s" in text
 
 
+def test_a_policy_is_not_played_on_other_observations_or_joints(tmp_path: Path) -> None:
+    play = (PLAY, "--checkpoint", "telebip_flat", "--duration", "1", "--device", "cpu")
+    assert "sees observations.policy as joint_pos (6), " in refusal(*play, "observations.policy.history=2")
+    other = tmp_path / "left_leg_first.xml"
+    sides = {"right": "left", "left": "right"}
+    text = (ROOT / "assets" / "telebip.xml").read_text()
+    other.write_text(re.sub("right|left", lambda side: sides[side[0]], text))
+    assert f"was trained on another robot than '{other}'" in refusal(*play, f"sim.robot={other}")
+
+
 def test_the_default_command_is_the_middle_of_overridden_ranges() -> None:
-    text = ran(PLAY, "--agent", "zero", "--duration", "0.1", "--device", "cpu", "command.lin_vel_x=[0.2,0.4]")
+    text = ran(PLAY, "--agent", "zero", "--duration", "0.1", "--device", "cpu", "commands.lin_vel_x=[0.2,0.4]")
     assert "0.30 m/s forward" in text
 
 
@@ -240,4 +251,4 @@ def test_a_dumped_fault_is_repeated_and_recorded(tmp_path: Path) -> None:
     other.write_text(own.read_text().replace("</worldbody>", '<geom name="more" size="0.1" pos="9 9 9"/></worldbody>'))
     assert f"the fault is of another robot than '{other}'" in refusal(PLAY, "--replay", str(fault), f"sim.robot={other}")
     assert "robot file" in refusal(PLAY, "--replay", str(fault), "sim.robot=nowhere.xml")
-    assert "this version reads 'telebip-fault-1'" in refusal(PLAY, "--replay", "assets/policies/telebip_flat/policy.pt")
+    assert "this version reads 'telebip-fault-2'" in refusal(PLAY, "--replay", "assets/policies/telebip_flat/policy.pt")

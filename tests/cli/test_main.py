@@ -53,21 +53,18 @@ def test_help_says_how_it_was_started(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("program", "own", "play"),
+    ("program", "train"),
     [
-        ("/usr/bin/telebip", "telebip train", "telebip play"),
-        ("scripts/train.py", "python scripts/train.py", "python scripts/play.py"),
-        ("scripts/reproduce.py", "python scripts/train.py", "python scripts/play.py"),
-        ("mine/train_level.py", "python mine/train_level.py", "python scripts/play.py"),
-        ("-c", "python scripts/train.py", "python scripts/play.py"),
+        ("/usr/bin/telebip", "telebip train"),
+        ("scripts/train.py", "python scripts/train.py"),
+        ("scripts/reproduce.py", "python scripts/train.py"),
+        ("mine/my_terms.py", "python mine/my_terms.py train"),
+        ("-c", "python scripts/train.py"),
     ],
 )
-def test_a_run_goes_on_with_the_program_that_started_it(
-    monkeypatch: pytest.MonkeyPatch, program: str, own: str, play: str
-) -> None:
+def test_a_run_goes_on_with_the_program_that_started_it(monkeypatch: pytest.MonkeyPatch, program: str, train: str) -> None:
     monkeypatch.setattr(sys, "argv", [program])
-    assert invocation("train", own=True) == own
-    assert invocation("play") == play
+    assert invocation("train") == train
 
 
 def test_the_command_passes_arguments_on_and_sets_the_exit_status() -> None:

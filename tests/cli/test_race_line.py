@@ -5,21 +5,33 @@ import re
 from pathlib import Path
 
 import pytest
-from processes import fresh
 from test_commands_line import ran, refusal
 
 RACE = "scripts/race.py"
 TINY = ("--device", "cpu", "num_envs=8", "ppo.num_steps_per_env=10", "ppo.hidden_dims=[8]", "episode.length=0.2", "seed=3")
 
 
-def test_two_seeds(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("precision", "arithmetic"), [("never", "float32"), ("always", "bfloat16")])
+def test_two_seeds(tmp_path: Path, precision: str, arithmetic: str) -> None:
     file, plot = tmp_path / "race.json", tmp_path / "race.png"
-    text = ran(RACE, "--samples", "2e2", "--seeds", "2", "--json", str(file), "--plot", str(plot), *TINY, run=fresh)
+    text = ran(
+        RACE,
+        "--samples",
+        "2e2",
+        "--seeds",
+        "2",
+        "--json",
+        str(file),
+        "--plot",
+        str(plot),
+        *TINY,
+        f"ppo.mixed_precision={precision}",
+    )
     first, second, about, both, *wrote = text.splitlines()
     number = r"-?\d+\.\d\d"
     assert re.fullmatch(f"seed 3: return {number}, rsl-rl's {number}; {number} times as fast", first)
     assert second.startswith("seed 4: ")
-    assert about.startswith("telebip_flat, 8 worlds, update in float32, 240 samples on ")
+    assert about.startswith(f"telebip_flat, 8 worlds, networks in {arithmetic}, 240 samples on ")
     meet = r"\((they overlap|they do not overlap)\)"
     assert re.fullmatch(
         f"2 seeds: return {number} to {number}, rsl-rl's {number} to {number} {meet}; {number} times as fast", both
@@ -29,7 +41,7 @@ def test_two_seeds(tmp_path: Path) -> None:
 
     content = json.loads(file.read_text())
     assert (content["task"], content["num_envs"], content["verdict"]["samples"]) == ("telebip_flat", 8, 240)
-    assert [race["seed"] for race in content["races"]] == [3, 4]
+    assert [(race["seed"], race["arithmetic"]) for race in content["races"]] == [(3, arithmetic), (4, arithmetic)]
 
 
 @pytest.mark.parametrize(

@@ -57,8 +57,8 @@ def test_a_report_without_a_folder_stays_in_reports(label: str, folder: str) -> 
         ([EVALUATE, "--checkpoint", "assets/policies/telebip_flat", "--out", "/proc/x"], "cannot write to folder '/proc/x'"),
         ([EVALUATE, "--controller", "dcm", "num_envs=99"], "'num_envs=99' cannot be overridden here; use --num-envs"),
         ([EVALUATE, "--controller", "dcm", "episode.length=1"], "use --duration"),
-        ([EVALUATE, "--controller", "dcm", "disturbance.push.enabled=true"], "the push suite has its own pushes"),
-        ([EVALUATE, "--controller", "dcm", "episode.reset_heading=3"], "robots that face x"),
+        ([EVALUATE, "--controller", "dcm", "events.push.force=20"], "the push suite has its own pushes"),
+        ([EVALUATE, "--controller", "dcm", "events.start_pose.heading=3"], "robots that face x"),
         ([REPRODUCE, "--only", "telebip_flta"], "did you mean 'telebip_flat'?"),
         ([REPRODUCE, "--seeds", "0"], "--seeds must be 1 or more, got 0"),
         (
@@ -81,8 +81,8 @@ def test_the_options_that_differ_from_the_defaults_measure_it_again() -> None:
 
 
 def test_a_command_with_spaces_and_brackets_can_be_pasted() -> None:
-    subject = evaluate.controller_subject("dcm", None, ["command.lin_vel_x=[0.2, 0.4]"])
-    assert subject.source == "evaluate.py --controller dcm 'command.lin_vel_x=[0.2, 0.4]'"
+    candidate = evaluate.controller_candidate("dcm", None, ["commands.lin_vel_x=[0.2, 0.4]"])
+    assert candidate.source == "evaluate.py --controller dcm 'commands.lin_vel_x=[0.2, 0.4]'"
 
 
 def test_signs_that_the_terminal_lacks_stop_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -160,3 +160,10 @@ def test_other_legs_are_refused(tmp_path: Path, before: str, after: str) -> None
     path.write_text(text.replace(before, after))
     with pytest.raises(UserError, match=r"robot\.xml: the model-based walkers need two like legs of hip roll"):
         Kinematics(load_robot(path), torch.device("cpu"))
+
+
+def test_other_joints_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "robot.xml"
+    path.write_text((ROOT / "assets/telebip.xml").read_text().replace("right_knee", "right_shin"))
+    with pytest.raises(UserError, match=r"robot\.xml: the model-based walkers need the joints right_hip_roll, .*, left_knee"):
+        Kinematics(load_robot(path), torch.device("cpu"))

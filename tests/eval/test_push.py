@@ -50,9 +50,9 @@ def test_limits_of_each_horizon_and_the_worse_side() -> None:
 
 def test_every_force_is_applied_in_its_direction_for_its_time(make_env: MakeEnv) -> None:
     protocol = PushProtocol(max_force=20.0, force_step=10.0, worlds=3, interval=0.4, warmup=0.2, horizons=(1.0,))
-    env = make_env(NEVER_FALL, "episode.reset_heading=0", calm=True, num_envs=protocol.num_envs)
+    env = make_env(NEVER_FALL, "events.start_pose.heading=0", calm=True, num_envs=protocol.num_envs)
     wrenches: list[torch.Tensor] = []
-    survival = push_trial(env, STAND, protocol, progress=lambda step: wrenches.append(env.push_wrench_w.clone()))
+    survival = push_trial(env, STAND, protocol, progress=lambda step: wrenches.append(env.state.wrench_w.clone()))
     assert survival.shape == (2, 4, 3)
     assert np.isinf(survival).all()
     wrench = torch.stack(wrenches).reshape(-1, 2, 4, 3, 6)  # steps, forces, directions, worlds
@@ -71,7 +71,7 @@ def test_every_force_is_applied_in_its_direction_for_its_time(make_env: MakeEnv)
 
 def test_a_fall_is_dated_from_the_end_of_the_warm_up(make_env: MakeEnv) -> None:
     protocol = PushProtocol(max_force=1000.0, force_step=1000.0, worlds=2, interval=0.3, warmup=0.1, horizons=(1.0, 2.0))
-    env = make_env("episode.reset_heading=0", calm=True, num_envs=protocol.num_envs)
+    env = make_env("events.start_pose.heading=0", calm=True, num_envs=protocol.num_envs)
     survival = push_trial(env, STAND, protocol)
     assert (survival < 2.0).all()  # 1000 N knock anyone over
     assert (survival > 0.0).all()

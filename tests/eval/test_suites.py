@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from telebip import ROOT
-from telebip.cli.evaluate import controller_subject, references, subject_of
+from telebip.cli.evaluate import checkpoint_candidate, controller_candidate, references
 from telebip.config import load_task
 from telebip.control.policy import Stateless
 from telebip.errors import UserError
@@ -18,8 +18,8 @@ from telebip.eval import plots
 from telebip.eval.learning import learning_curve, samples_to
 from telebip.eval.push import PushProtocol
 from telebip.eval.report import can_be_shown, read_results, write_report, write_results
-from telebip.eval.suites import SUITES, Protocol, Subject, check_suites, commands_of, evaluate, is_current, make_env
-from telebip.robot import Robot
+from telebip.eval.suites import SUITES, Candidate, Protocol, check_suites, commands_of, evaluate, is_current, make_env
+from telebip.robot import Robot, load_robot
 
 POLICY = "assets/policies/telebip_flat"
 PROTOCOL = Protocol(
@@ -28,13 +28,13 @@ PROTOCOL = Protocol(
 
 
 @pytest.fixture(scope="module")
-def subject() -> Subject:
-    return subject_of(POLICY, "flat")
+def candidate() -> Candidate:
+    return checkpoint_candidate(POLICY, "flat")
 
 
 @pytest.fixture(scope="module")
-def results(subject: Subject, robot: Robot) -> dict[str, Any]:
-    return evaluate(subject, robot, SUITES, PROTOCOL)
+def results(candidate: Candidate, robot: Robot) -> dict[str, Any]:
+    return evaluate(candidate, robot, SUITES, PROTOCOL)
 
 
 def test_tracking_measures_every_trained_command(results: dict[str, Any]) -> None:
@@ -62,9 +62,9 @@ def test_gait_and_pushes(results: dict[str, Any]) -> None:
     }
 
 
-def test_the_same_seed_gives_the_same_results(subject: Subject, robot: Robot) -> None:
+def test_the_same_seed_gives_the_same_results(candidate: Candidate, robot: Robot) -> None:
     protocol = dataclasses.replace(PROTOCOL, duration=3.0, skip=1.0)
-    a, b = (evaluate(subject, robot, ("tracking", "gait"), protocol) for _ in range(2))
+    a, b = (evaluate(candidate, robot, ("tracking", "gait"), protocol) for _ in range(2))
     assert a["gait"]["period_s"] > 0.0
     assert a | {"date": ""} == b | {"date": ""}
 
@@ -90,22 +90,22 @@ def test_results_are_json_and_come_back(results: dict[str, Any], tmp_path: Path)
     assert back["tracking"] == results["tracking"]
 
 
-def test_results_are_current_for_the_same_subject_measured_in_the_same_way(
-    results: dict[str, Any], subject: Subject, tmp_path: Path
+def test_results_are_current_for_the_same_candidate_measured_in_the_same_way(
+    results: dict[str, Any], candidate: Candidate, tmp_path: Path
 ) -> None:
     write_results(results, tmp_path)
     back = read_results(tmp_path / "results.json")
-    assert is_current(back, subject, SUITES, PROTOCOL)
-    assert not is_current(back, subject, SUITES, dataclasses.replace(PROTOCOL, worlds=5))
-    assert not is_current(back, subject, SUITES, dataclasses.replace(PROTOCOL, push=PushProtocol()))
-    assert not is_current(back, dataclasses.replace(subject, fingerprint="of another"), SUITES, PROTOCOL)
-    assert not is_current({key: value for key, value in back.items() if key != "gait"}, subject, SUITES, PROTOCOL)
+    assert is_current(back, candidate, SUITES, PROTOCOL)
+    assert not is_current(back, candidate, SUITES, dataclasses.replace(PROTOCOL, worlds=5))
+    assert not is_current(back, candidate, SUITES, dataclasses.replace(PROTOCOL, push=PushProtocol()))
+    assert not is_current(back, dataclasses.replace(candidate, fingerprint="of another"), SUITES, PROTOCOL)
+    assert not is_current({key: value for key, value in back.items() if key != "gait"}, candidate, SUITES, PROTOCOL)
 
 
-def test_results_that_lack_something_are_not_current(results: dict[str, Any], subject: Subject) -> None:
+def test_results_that_lack_something_are_not_current(results: dict[str, Any], candidate: Candidate) -> None:
     for lacking in ({"push": None}, {"push": {}}, {"gait": None}, {"tracking": []}, {"protocol": None}):
-        assert not is_current(results | lacking, subject, SUITES, PROTOCOL)
-    assert not is_current({key: value for key, value in results.items() if key != "fingerprint"}, subject, SUITES, PROTOCOL)
+        assert not is_current(results | lacking, candidate, SUITES, PROTOCOL)
+    assert not is_current({key: value for key, value in results.items() if key != "fingerprint"}, candidate, SUITES, PROTOCOL)
 
 
 def test_results_that_lack_something_cannot_be_shown(results: dict[str, Any]) -> None:
@@ -116,7 +116,7 @@ def test_results_that_lack_something_cannot_be_shown(results: dict[str, Any]) ->
 
 
 def test_a_controller_is_told_by_its_parameters() -> None:
-    own, same, other = (controller_subject("dcm", None, overrides) for overrides in ((), (), ("control.step_time=0.3",)))
+    own, same, other = (controller_candidate("dcm", None, overrides) for overrides in ((), (), ("control.step_time=0.3",)))
     assert own.fingerprint == same.fingerprint != other.fingerprint
 
 
@@ -128,8 +128,8 @@ def test_the_report_takes_any_number_of_commands_and_a_single_world(results: dic
     assert "nan" not in (tmp_path / "report.md").read_text()
 
 
-def test_a_walk_has_a_step_at_least(subject: Subject, robot: Robot) -> None:
-    slow = dataclasses.replace(subject, config=load_task(subject.config, ["sim.decimation=1000"]))
+def test_a_walk_has_a_step_at_least(candidate: Candidate, robot: Robot) -> None:
+    slow = dataclasses.replace(candidate, config=load_task(candidate.config, ["sim.decimation=1000"]))
     rows = evaluate(slow, robot, ("tracking",), dataclasses.replace(PROTOCOL, worlds=1, duration=1.0, skip=0.0))["tracking"]
     assert len(rows) == 3
 
@@ -186,26 +186,47 @@ def test_suites_are_checked_and_ordered() -> None:
 
 
 def test_overrides_hold_in_the_worlds_that_are_measured(robot: Robot) -> None:
-    overrides = ("disturbance.friction.enabled=true", "disturbance.friction.range=[0.05,0.06]", "episode.reset_heading=3")
-    slippery = make_env(subject_of(POLICY, None, overrides), robot, PROTOCOL, num_envs=2, duration=1.0)
-    assert (slippery.sim.model_fields["geom_friction"][:, robot.engine_floor_id, 0] < 0.07).all()
-    assert slippery.cfg.episode.reset_heading == 3.0
-    assert not slippery.cfg.disturbance.push.enabled
-    pushed = controller_subject("dcm", None, ("disturbance.push.enabled=true", "control.step_time=0.3"))
-    assert make_env(pushed, robot, PROTOCOL, num_envs=2, duration=1.0).cfg.disturbance.push.enabled
+    overrides = ("events.friction.range=[0.05,0.06]", "events.start_pose.heading=3")
+    slippery = make_env(checkpoint_candidate(POLICY, None, overrides), robot, PROTOCOL, num_envs=2, duration=1.0)
+    floor = slippery.sim.model.geom("floor").id
+    assert (slippery.sim.model_fields["geom_friction"][:, floor, 0] < 0.07).all()
+    assert slippery.cfg.events["start_pose"]["heading"] == 3.0
+    assert "push" not in slippery.cfg.events
+    pushed = controller_candidate("dcm", None, ("events.push.force=20", "control.step_time=0.3"))
+    config = make_env(pushed, robot, PROTOCOL, num_envs=2, duration=1.0).cfg
+    assert config.events["push"]["force"] == 20.0
+    assert [*config.observations] == ["policy", "estimate"]
+    never = checkpoint_candidate(POLICY, None, ("events.push=null", "gait.period=0.6"))
+    assert "push" not in make_env(never, robot, PROTOCOL, num_envs=2, duration=1.0).cfg.events
+    assert (never.task.gait.period, never.config.gait.period) == (0.6, 0.5)
 
 
-def test_commands_keep_to_what_was_trained(subject: Subject) -> None:
-    everything = Subject("any", subject.config, lambda env: Stateless(lambda obs: torch.zeros(1, 6)), limited=False)
+@pytest.mark.parametrize(("name", "has_prismatic_knees"), [("four_joints", True), ("ten_joints", False)])
+def test_a_robot_with_other_joints_is_measured_too(name: str, has_prismatic_knees: bool, tmp_path: Path) -> None:
+    task = load_task(f"tests/robots/{name}.yaml")
+    robot = load_robot(task.sim.robot)
+    stands = Candidate(name, task, lambda env: Stateless(lambda obs: torch.zeros(env.num_envs, env.num_actions)))
+    protocol = dataclasses.replace(PROTOCOL, worlds=2, duration=2.0, skip=0.5)
+    results = evaluate(stands, robot, ("tracking", "push", "gait"), protocol)
+    for row in results["tracking"]:
+        assert tuple(row["cot_joints"]) == robot.joint_names
+    assert (results["gait"]["knee_stroke_m"] >= 0.0) == has_prismatic_knees  # else it is NaN
+    write_results(results, tmp_path)
+    write_report([results], tmp_path, name)
+    assert can_be_shown(read_results(tmp_path / "results.json"))
+
+
+def test_commands_keep_to_what_was_trained(candidate: Candidate) -> None:
+    everything = Candidate("any", candidate.config, lambda env: Stateless(lambda obs: torch.zeros(1, 6)), is_model_based=True)
     assert commands_of(everything, PROTOCOL) == (0.5, 0.7, 1.0, -0.3)
-    assert commands_of(subject, PROTOCOL) == (0.5, 0.7, 1.0)
-    assert commands_of(subject, dataclasses.replace(PROTOCOL, commands=(0.2,))) == (0.2,)
+    assert commands_of(candidate, PROTOCOL) == (0.5, 0.7, 1.0)
+    assert commands_of(candidate, dataclasses.replace(PROTOCOL, commands=(0.2,))) == (0.2,)
 
 
-def test_a_damaged_learning_curve_is_named_before_anything_is_measured(subject: Subject, robot: Robot, tmp_path: Path) -> None:
+def test_a_damaged_learning_curve_is_named_first(candidate: Candidate, robot: Robot, tmp_path: Path) -> None:
     (tmp_path / "learning.csv").write_text("nothing\n")
     steps: list[int] = []
-    damaged = dataclasses.replace(subject, run_dir=tmp_path)
+    damaged = dataclasses.replace(candidate, run_dir=tmp_path)
     with pytest.raises(UserError, match=r"learning\.csv is damaged"):
         evaluate(damaged, robot, SUITES, PROTOCOL, lambda name, step, total: steps.append(step))
     assert steps == []

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from telebip.control.policy import Stateless
 from telebip.env import TelebipEnv
-from telebip.eval.rollout import Rollout, roll_out
 from telebip.eval.walk import cost_of_transport, heading_velocity, summarise
-from telebip.mdp.rewards import REWARDS
+from telebip.rollout import Rollout, roll_out
 
 STEP_DT, WEIGHT = 0.02, 130.0  # s, N
+JOINTS = ("right_hip_roll", "right_hip_pitch", "right_knee", "left_hip_roll", "left_hip_pitch", "left_knee")
 
 
 def facing(angle: float | NDArray[np.floating]) -> NDArray[np.floating]:
@@ -24,18 +24,19 @@ def facing(angle: float | NDArray[np.floating]) -> NDArray[np.floating]:
     return np.stack([np.cos(half), zero, zero, np.sin(half)], axis=-1)
 
 
-def walk(steps: int = 200, worlds: int = 2, **replaced: Any) -> Rollout:
+def walk(steps: int = 200, worlds: int = 2, joint_names: tuple[str, ...] = JOINTS, **replaced: Any) -> Rollout:
     """Return a rollout that stands still facing x, with the given arrays in place of zeros (they broadcast)."""
-    sizes = {"qpos": 13, "qvel": 12, "joint_target": 6, "joint_force": 6, "joint_power": 6}
+    n = len(joint_names)
+    sizes = {"qpos": 7 + n, "qvel": 6 + n, "joint_pos": n, "joint_target": n, "joint_force": n, "joint_power": n}
     sizes |= {
-        "joint_net_power": 6,
+        "joint_net_power": n,
         "foot_force": 2,
         "push_w": 3,
         "phase": 2,
         "command": 3,
         "reference_heading": 0,
         "reward": 0,
-        "reward_terms": len(REWARDS),
+        "reward_terms": 2,
         "fallen": 0,
     }
     arrays = {}
@@ -46,7 +47,7 @@ def walk(steps: int = 200, worlds: int = 2, **replaced: Any) -> Rollout:
         if name in replaced:
             array[...] = replaced[name]
         arrays[name] = array
-    return Rollout(step_dt=STEP_DT, weight=WEIGHT, reward_names=tuple(REWARDS), **arrays)
+    return Rollout(step_dt=STEP_DT, weight=WEIGHT, joint_names=joint_names, reward_names=("cmd", "foot"), **arrays)
 
 
 def velocity(forward: float, left: float = 0.0) -> NDArray[np.floating]:
@@ -68,6 +69,14 @@ def test_cost_of_transport_sums_the_joints_and_ignores_the_swaying() -> None:
     assert summary.cost_of_transport == pytest.approx(65.0 / (130.0 * 0.5))
     assert summary.cost_of_transport_article == pytest.approx(1.0 + 1.0 / 130.0)
     assert summary.joint_cost_of_transport == pytest.approx([power / 65.0 for power in (10, 20, 5, 10, 15, 5)])
+
+
+def test_any_number_of_joints_shares_the_cost_of_transport() -> None:
+    names = (*JOINTS, "right_ankle", "left_ankle")
+    qvel = np.pad(velocity(0.5), (0, 2))
+    summary = summarise(walk(joint_names=names, qvel=qvel, joint_power=[10.0] * 8), skip=0.0)
+    assert summary.joint_cost_of_transport == pytest.approx([10.0 / 65.0] * 8)
+    assert summary.cost_of_transport == pytest.approx(80.0 / 65.0)
 
 
 def test_positive_work_leaves_out_what_an_actuator_brakes() -> None:
@@ -129,7 +138,8 @@ def test_a_rollout_of_real_worlds(make_env: Callable[..., TelebipEnv]) -> None:
     assert finished == list(range(1, 16))
     np.testing.assert_allclose(rollout.time, np.linspace(0.02, 0.30, 15))
     assert (rollout.step_dt, rollout.weight) == (pytest.approx(0.02), pytest.approx(13.6 * 9.81))
-    shapes = {"qpos": (13,), "qvel": (12,), "joint_target": (6,), "joint_force": (6,), "joint_power": (6,)}
+    assert (rollout.joint_names, rollout.reward_names) == (JOINTS, env.reward_names)
+    shapes = {"qpos": (13,), "qvel": (12,), "joint_pos": (6,), "joint_target": (6,), "joint_force": (6,), "joint_power": (6,)}
     shapes |= {
         "joint_net_power": (6,),
         "foot_force": (2,),
@@ -138,7 +148,7 @@ def test_a_rollout_of_real_worlds(make_env: Callable[..., TelebipEnv]) -> None:
         "command": (3,),
         "reference_heading": (),
         "reward": (),
-        "reward_terms": (len(REWARDS),),
+        "reward_terms": (len(env.reward_names),),
         "fallen": (),
     }
     for name, shape in shapes.items():
@@ -146,6 +156,7 @@ def test_a_rollout_of_real_worlds(make_env: Callable[..., TelebipEnv]) -> None:
     np.testing.assert_allclose(rollout.reward_terms.sum(-1), rollout.reward, atol=1e-6)
     assert not rollout.fallen.any()  # time-outs are no falls
     np.testing.assert_array_equal(rollout.qpos[-1], env.sim.state.qpos.numpy())
+    np.testing.assert_array_equal(rollout.joint_pos, rollout.qpos[..., 7:])
     assert np.ptp(rollout.qpos[:, :, 9], axis=0).min() > 0.0  # rows are copies, not one live buffer
     np.testing.assert_allclose(rollout.phase[3, :, 0], math.sin(2 * math.pi * 0.08 / 0.5), rtol=1e-5)
     np.testing.assert_array_equal(

@@ -4,6 +4,8 @@
 import ast
 import runpy
 import sys
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,18 +13,21 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from worlds import CALM
 
+import telebip
 from telebip import ROOT
 from telebip.config import load_task
+from telebip.config.schema import ObservationGroup
 from telebip.env import TelebipEnv
 from telebip.rl.checkpoint import load_checkpoint
 from telebip.rl.export import export
 from telebip.rl.policy import load_policy
-from telebip.robot import Robot
+from telebip.rl.train import Trainer
+from telebip.robot import Robot, load_robot
 
 EXAMPLE = ROOT / "examples" / "deploy_mujoco.py"
-CALM = [f"disturbance.{name}.enabled=false" for name in ("push", "friction", "noise")]
-STILL = [f"episode.reset_{name}=0" for name in ("joint_pos", "joint_vel", "lin_vel", "ang_vel")]
+STILL = ("events.start_pose.joint_pos=0", "events.start_velocity=null")
 
 
 @pytest.fixture(scope="module")
@@ -37,8 +42,21 @@ def deploy() -> SimpleNamespace:
     return SimpleNamespace(**runpy.run_path(str(EXAMPLE)))
 
 
+@pytest.fixture
+def untrained(tmp_path: Path) -> Callable[[str, dict, int], Path]:
+    """Return a function that exports a policy with random weights for a robot of the tests."""
+
+    def make(name: str, terms: dict, history: int = 1) -> Path:
+        task = load_task(str(ROOT / "tests" / "robots" / f"{name}.yaml"), ["num_envs=4"])
+        task = replace(task, observations={"policy": ObservationGroup(terms, history)})
+        export(Trainer(telebip.make(task), name, tmp_path).policy(), tmp_path / "policy.onnx", samples=100)
+        return tmp_path / "policy.onnx"
+
+    return make
+
+
 def walk_env(robot: Robot, exported: Path, command: tuple[float, float, float], seconds: float) -> np.ndarray:
-    """Return the environment's trajectory, (1 + steps, 13), from a random heading."""
+    """Return the environment's trajectory, (1 + steps, nq), from a random heading."""
     checkpoint = load_checkpoint(exported)
     env = TelebipEnv(load_task(checkpoint.config, ["num_envs=1", "episode.length=60", "seed=4", *CALM, *STILL]), robot, "cpu")
     env.set_command(*command)
@@ -65,6 +83,26 @@ def test_it_walks_the_environments_trajectory(
     if seconds > 10.0:
         distance = np.linalg.norm(trajectory[-1, :2] - trajectory[500, :2])
         assert distance / (seconds - 10.02) == pytest.approx(command[0], rel=0.05)
+
+
+@pytest.mark.parametrize("name", ["four_joints", "ten_joints"])
+def test_another_robot_and_another_observation(deploy: SimpleNamespace, untrained: Callable[..., Path], name: str) -> None:
+    terms = ("projected_gravity", "phase", "joint_vel", "joint_pos", "command", "last_action")
+    file = untrained(name, {term: {"noise": 0.0} for term in terms}, history=3)
+    robot = load_robot(ROOT / "tests" / "robots" / f"{name}.xml")
+    expected = walk_env(robot, file, (0.5, 0.0, 0.1), seconds=0.4)
+    policy = deploy.Policy(file)
+    simulated = deploy.SimulatedRobot(robot.path, policy.about)
+    simulated.data.qpos[:] = expected[0]
+    trajectory = deploy.walk(policy, simulated, np.array([0.5, 0.0, 0.1]), 0.4)
+    np.testing.assert_allclose(trajectory, expected[1:], atol=2e-4)
+    assert np.abs(trajectory[-1, 7:] - expected[0, 7:]).max() > 0.01  # it does move
+
+
+def test_a_term_that_it_does_not_know_is_one_line(deploy: SimpleNamespace, untrained: Callable[..., Path]) -> None:
+    file = untrained("four_joints", {"joint_pos": {"noise": 0.0}, "base_height": {"noise": 0.0}})
+    with pytest.raises(SystemExit, match=r"policy.onnx: the policy sees 'base_height', which this example does not know"):
+        deploy.Policy(file)
 
 
 def test_its_command_line(

@@ -1,5 +1,7 @@
 """Gymnasium's contract: spaces that hold, episodes that end as declared, its own checker and wrappers, and the same physics."""
 
+from dataclasses import replace
+
 import gymnasium
 import numpy as np
 import pytest
@@ -12,14 +14,15 @@ from gymnasium.wrappers.vector import (
     RecordEpisodeStatistics,
     RescaleAction,
 )
+from worlds import CALM
 
 import telebip.gym
-from telebip.config import task_names
+from telebip.config import load_task, task_names
+from telebip.config.schema import ObservationGroup
 from telebip.errors import UserError
-from telebip.gym.env import ACTION_NAMES, OBSERVATION_NAMES, TelebipVectorEnv
+from telebip.gym.env import TelebipVectorEnv
 from telebip.robot import Robot
 
-CALM = tuple(f"disturbance.{name}.enabled=false" for name in ("push", "friction", "noise"))
 SHORT = "episode.length=0.2"  # ten policy steps
 
 
@@ -37,7 +40,7 @@ def test_every_task_is_registered() -> None:
     assert names <= set(gymnasium.registry)
     env = make(name="telebip/Slow-v0", num_envs=2)
     assert isinstance(env, TelebipVectorEnv)
-    assert env.worlds.cfg.command.lin_vel_x == (0.4, 0.7)
+    assert env.worlds.cfg.commands.lin_vel_x == (0.4, 0.7)
     assert env.spec is not None
     assert env.spec.id == "telebip/Slow-v0"
 
@@ -51,11 +54,12 @@ def test_the_spaces_have_shapes_bounds_and_names(robot: Robot) -> None:
     env = make(num_envs=3)
     assert env.observation_space.shape == (3, 33)
     assert env.action_space.shape == (3, 6)
-    assert env.metadata["observation_names"] == OBSERVATION_NAMES
-    assert env.metadata["action_names"] == ACTION_NAMES
-    assert OBSERVATION_NAMES[2] == "joint_pos/right_knee"
-    assert OBSERVATION_NAMES[24:28] == ("base_quat/w", "base_quat/x", "base_quat/y", "base_quat/z")
-    assert len(OBSERVATION_NAMES) == 33
+    assert env.metadata["action_names"] == robot.joint_names
+    names = env.metadata["observation_names"]
+    assert names[2] == "joint_pos/right_knee"
+    assert names[24:28] == ("base_quat/w", "base_quat/x", "base_quat/y", "base_quat/z")
+    assert names[28:] == ("command/lin_vel_x", "command/lin_vel_y", "command/ang_vel_z", "phase/right", "phase/left")
+    assert len(names) == 33
     space = env.single_action_space
     assert isinstance(space, gymnasium.spaces.Box)
     # Hip roll: range +-0.6 rad, 50 N m / (200 N m/rad) beyond it, scale 0.25 rad. Knee: from home at 0.04 m, scale 0.1 m.
@@ -70,8 +74,30 @@ def test_the_spaces_have_shapes_bounds_and_names(robot: Robot) -> None:
     assert seen.high[12:18] == pytest.approx(space.high)
 
 
-def test_observations_and_actions_stay_in_their_spaces() -> None:
-    env = make(num_envs=16)
+def test_a_task_of_ones_own_has_its_own_names_and_bounds() -> None:
+    task = load_task("telebip_flat")
+    terms = {"gravity": {"term": "projected_gravity", "noise": 0.1}, "joint_pos": {"noise": 0.0}, "base_height": {"noise": 0.0}}
+    groups = {"policy": ObservationGroup(terms, history=2), "critic": task.observations["policy"]}
+    env = TelebipVectorEnv(2, replace(task, observations=groups))
+    names = env.metadata["observation_names"]
+    assert list(env.worlds.groups) == ["policy"]  # nobody sees the critic's
+    assert names[:4] == ("gravity/x", "gravity/y", "gravity/z", "joint_pos/right_hip_roll")
+    assert names[9:13] == ("base_height/0", "gravity/x@-1", "gravity/y@-1", "gravity/z@-1")
+    seen = env.single_observation_space
+    assert isinstance(seen, gymnasium.spaces.Box)
+    assert seen.shape == (20,)
+    assert seen.high[:3] == pytest.approx([1.1] * 3, abs=1e-5)
+    assert np.isinf(seen.high[3:10]).all()
+    np.testing.assert_array_equal(seen.low[:10], seen.low[10:])
+    env.reset(seed=0)
+    obs, *_ = env.step(np.zeros((2, 6), dtype=np.float32))
+    assert env.observation_space.contains(obs)
+
+
+@pytest.mark.parametrize("task", ["telebip_flat", "tests/robots/four_joints.yaml", "tests/robots/ten_joints.yaml"])
+def test_observations_and_actions_stay_in_their_spaces(task: str) -> None:
+    env = TelebipVectorEnv(16, task)
+    assert env.single_action_space.shape == (len(env.metadata["action_names"]),)
     env.action_space.seed(0)
     obs, _ = env.reset(seed=0)
     assert env.observation_space.contains(obs)
@@ -186,4 +212,4 @@ def test_gymnasiums_wrappers_apply() -> None:
     wrapped.step(np.full((4, 6), 2.0, dtype=np.float32))
     unwrapped = wrapped.unwrapped
     assert isinstance(unwrapped, TelebipVectorEnv)
-    np.testing.assert_allclose(unwrapped.worlds.last_action.numpy(), unwrapped.action_space.high, rtol=1e-5)  # type: ignore[attr-defined]
+    np.testing.assert_allclose(unwrapped.worlds.state.last_action.numpy(), unwrapped.action_space.high, rtol=1e-5)  # type: ignore[attr-defined]

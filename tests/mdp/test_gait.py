@@ -1,27 +1,44 @@
 """The gait clock and the window of the periodic foot reward."""
 
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
+from steps import make_world
+from torch import Tensor
 
-from telebip.mdp.gait import foot_sample, phase_signals, push_sample, window_length, window_weights
-from telebip.mdp.rewards import periodic_foot_force
+from telebip.mdp.gait import phase_signals, window_weights
+from telebip.mdp.rewards import foot
+from telebip.mdp.term import find
+from telebip.robot import Robot
 
 PERIOD, STEP_DT, WEIGHT = 0.5, 0.02, 133.416
 UNCAPPED = 100.0  # body weights
 HALF = math.sqrt(0.5)
 
 
-def walked_window(first_foot: int) -> torch.Tensor:
-    """One period in which the foot that the phase asks for (or, with 1, the other) carries all of the weight."""
-    window = torch.zeros(1, window_length(PERIOD, STEP_DT))
-    for step in range(window.shape[1]):
+def pressed(phase: Tensor, force: Tensor, weight: float) -> Any:
+    """A step with these phase signals and foot forces."""
+    return SimpleNamespace(phase=phase, state=SimpleNamespace(foot_force=force), world=SimpleNamespace(weight=weight))
+
+
+def foot_sample(phase: Tensor, force: Tensor, weight: float, cap: float) -> Tensor:
+    """The reward of a window of one sample, the newest."""
+    memory = {"window": torch.zeros(len(phase), 1)}
+    return foot(pressed(phase, force, weight), memory, k_foot=1.0, gamma=0.5, first="newest", cap=cap)
+
+
+def walked(first_foot: int, gamma: float, first: str) -> Tensor:
+    """The reward after a period in which the foot that the phase asks for (or, with 1, the other) carries all of the weight."""
+    memory, reward = {"window": torch.zeros(1, 26)}, torch.zeros(1)
+    for step in range(26):
         phase = phase_signals(torch.tensor([step * STEP_DT]), PERIOD)
         force = torch.zeros(1, 2)
         force[0, first_foot if phase[0, 0] > 0.0 else 1 - first_foot] = WEIGHT
-        window = push_sample(window, foot_sample(phase, force, WEIGHT, UNCAPPED))
-    return window
+        reward = foot(pressed(phase, force, WEIGHT), memory, k_foot=0.1, gamma=gamma, first=first, cap=UNCAPPED)  # type: ignore[arg-type]
+    return reward
 
 
 @pytest.mark.parametrize(
@@ -39,9 +56,12 @@ def test_half_a_period_later_the_feet_have_changed_roles() -> None:
     )
 
 
-def test_window_holds_both_ends_of_one_period() -> None:
-    assert window_length(0.5, 0.02) == 26
-    assert window_length(0.6, 0.02) == 31
+@pytest.mark.parametrize(("period", "samples"), [(0.5, 26), (0.6, 31)])
+def test_window_holds_both_ends_of_one_period(robot: Robot, period: float, samples: int) -> None:
+    memory = find("reward", "foot").memory
+    assert memory is not None
+    (window,) = memory(make_world(robot, num_envs=3, gait_period=period)).values()
+    assert torch.equal(window, torch.zeros(3, samples))
 
 
 def test_newest_sample_weighs_one_and_the_rest_fade() -> None:
@@ -79,23 +99,22 @@ def test_mirroring_the_world_leaves_the_foot_sample_unchanged() -> None:
 
 
 def test_new_sample_enters_in_front_and_the_oldest_leaves() -> None:
-    window = torch.tensor([[3.0, 2.0, 1.0], [30.0, 20.0, 10.0]])
-    pushed = push_sample(window, torch.tensor([4.0, 40.0]))
-    torch.testing.assert_close(pushed, torch.tensor([[4.0, 3.0, 2.0], [40.0, 30.0, 20.0]]))
+    memory = {"window": torch.tensor([[3.0, 2.0, 1.0], [30.0, 20.0, 10.0]])}
+    step = pressed(torch.tensor([[1.0, -1.0]]).expand(2, -1), torch.tensor([[4.0, 0.0], [40.0, 0.0]]), 1.0)
+    foot(step, memory, k_foot=0.1, gamma=0.5, first="newest", cap=UNCAPPED)
+    torch.testing.assert_close(memory["window"], torch.tensor([[4.0, 3.0, 2.0], [40.0, 30.0, 20.0]]))
 
 
 @pytest.mark.parametrize("first", ["newest", "oldest"])
 def test_walking_in_phase_pays_what_walking_out_of_phase_costs(first: str) -> None:
-    weights = window_weights(26, 0.8, first)
-    in_phase = periodic_foot_force(walked_window(0), weights, 0.1)
+    in_phase = walked(0, 0.8, first)
     assert in_phase.item() > 0.2
-    torch.testing.assert_close(periodic_foot_force(walked_window(1), weights, 0.1), -in_phase)
+    torch.testing.assert_close(walked(1, 0.8, first), -in_phase)
 
 
 def test_perfect_stepping_without_discount_sums_the_sine_over_a_period() -> None:
     # sum over k = 0..24 of |sin(2 pi k / 25)| = cot(pi / 50) = 15.895
-    reward = periodic_foot_force(walked_window(0), window_weights(26, 1.0, "newest"), 0.1)
-    assert reward.item() == pytest.approx(0.1 / math.tan(math.pi / 50), rel=1e-5)
+    assert walked(0, 1.0, "newest").item() == pytest.approx(0.1 / math.tan(math.pi / 50), rel=1e-5)
 
 
 def test_standing_on_both_feet_earns_nothing() -> None:

@@ -1,33 +1,39 @@
 """Every reward term at values worked out by hand."""
 
-import dataclasses
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
+from steps import bind, make_step
+from torch import Tensor
 
-from telebip.config.schema import (
-    CmdRewardConfig,
-    DiffRewardConfig,
-    EnergyRewardConfig,
-    FootRewardConfig,
-    RewardConfig,
-    TerminationRewardConfig,
-    TqRewardConfig,
-)
-from telebip.mdp.context import StepContext
-from telebip.mdp.rewards import (
-    REWARDS,
-    action_difference,
-    periodic_foot_force,
-    termination,
-    torque,
-    velocity_tracking,
-    yaw_rate_tracking,
-)
-from telebip.sim.base import SimState
+from telebip.config import load_task
+from telebip.mdp import rewards
+from telebip.mdp.step import Step
+from telebip.mdp.term import TERMS
+from telebip.robot import Robot
 
 FORCE_LIMIT = torch.tensor([50.0, 50.0, 400.0, 50.0, 50.0, 400.0])
+
+
+def moving(command: Tensor, lin_vel: Tensor | None = None, ang_vel: Tensor | None = None) -> Any:
+    """A step with these command and velocities of the trunk in the body frame."""
+    still = torch.zeros_like(command)
+    return SimpleNamespace(
+        command=command,
+        base_lin_vel_b=still if lin_vel is None else lin_vel,
+        base_ang_vel_b=still if ang_vel is None else ang_vel,
+    )
+
+
+def velocity_tracking(lin_vel: Tensor, command: Tensor, k_xy: float, sigma_xy: float) -> Tensor:
+    return rewards.cmd(moving(command, lin_vel=lin_vel), k_xy=k_xy, sigma_xy=sigma_xy, k_w=0.0, sigma_w=1.0)
+
+
+def yaw_rate_tracking(ang_vel: Tensor, command: Tensor, k_w: float, sigma_w: float) -> Tensor:
+    return rewards.cmd(moving(command, ang_vel=ang_vel), k_xy=0.0, sigma_xy=1.0, k_w=k_w, sigma_w=sigma_w)
 
 
 @pytest.mark.parametrize(("error", "expected"), [(0.0, 0.2), (0.3, 0.2 / math.e), (0.6, 0.2 / math.e**2)])
@@ -51,10 +57,25 @@ def test_yaw_rate_tracking_decays_alike_on_both_sides(rate: float, expected: flo
     torch.testing.assert_close(yaw_rate_tracking(ang_vel, command, k_w=0.15, sigma_w=0.2), torch.tensor([expected]))
 
 
+def test_velocity_and_yaw_rate_pay_separately() -> None:
+    command = torch.tensor([[0.7, 0.0, 0.1]])
+    step = moving(command, lin_vel=torch.tensor([[0.4, 0.0, 0.0]]), ang_vel=torch.tensor([[0.0, 0.0, 0.3]]))
+    reward = rewards.cmd(step, k_xy=0.2, sigma_xy=0.3, k_w=0.15, sigma_w=0.2)
+    torch.testing.assert_close(reward, torch.tensor([0.35 / math.e]))
+
+
+def test_tracking_rewards_are_largest_at_the_command() -> None:
+    command = torch.tensor([[0.7, 0.1, 0.2]]).expand(256, -1)
+    velocity = torch.randn(256, 3, generator=torch.Generator().manual_seed(0))
+    assert (velocity_tracking(velocity, command, 0.2, 0.3) < 0.2).all()
+    assert (yaw_rate_tracking(velocity, command, 0.15, 0.2) < 0.15).all()
+
+
 def test_action_difference_is_the_norm_of_the_change() -> None:
     last = torch.ones(2, 6)
     action = last + torch.tensor([[0.0] * 6, [3.0, 0.0, 0.0, 0.0, 4.0, 0.0]])
-    torch.testing.assert_close(action_difference(action, last, k_diff=-0.02), torch.tensor([0.0, -0.1]))
+    step: Any = SimpleNamespace(action=action, last_action=last)
+    torch.testing.assert_close(rewards.diff(step, k_diff=-0.02), torch.tensor([0.0, -0.1]))
 
 
 @pytest.mark.parametrize(
@@ -68,73 +89,88 @@ def test_action_difference_is_the_norm_of_the_change() -> None:
     ],
 )
 def test_torque_counts_saturated_actuators(force: list[float], expected: float) -> None:
-    torch.testing.assert_close(torque(torch.tensor([force]), FORCE_LIMIT, k_tq=-0.05), torch.tensor([expected]))
+    state, world = SimpleNamespace(joint_force=torch.tensor([force])), SimpleNamespace(force_limit=FORCE_LIMIT)
+    step: Any = SimpleNamespace(state=state, world=world)
+    torch.testing.assert_close(rewards.tq(step, k_tq=-0.05), torch.tensor([expected]))
 
 
 def test_periodic_foot_force_weighs_each_sample_by_its_age() -> None:
-    window = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, -2.0, 4.0]])
-    weights = torch.tensor([1.0, 0.5, 0.25])
-    torch.testing.assert_close(periodic_foot_force(window, weights, k_foot=0.1), torch.tensor([0.1, 0.025, 0.1]))
+    # The newest samples are 1, 0 and 1: half of them from the right foot where the phase asks for it.
+    state = SimpleNamespace(foot_force=torch.tensor([[100.0, 0.0], [0.0, 0.0], [0.0, 100.0]]))
+    phase = torch.tensor([[1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]])
+    step: Any = SimpleNamespace(state=state, phase=phase, world=SimpleNamespace(weight=100.0))
+    memory = {"window": torch.tensor([[0.0, 0.0, 9.0], [0.0, 1.0, 9.0], [-2.0, 4.0, 9.0]])}
+    reward = rewards.foot(step, memory, k_foot=0.1, gamma=0.5, first="newest", cap=100.0)
+    torch.testing.assert_close(memory["window"], torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, -2.0, 4.0]]))
+    torch.testing.assert_close(reward, torch.tensor([0.1, 0.025, 0.1]))
+
+
+@pytest.mark.parametrize(("samples", "share"), [(0.0, 0.0), (1000.0, 0.0), (2000.0, 0.5), (3000.0, 1.0), (math.inf, 1.0)])
+def test_energy_is_the_power_in_body_weights_times_its_share(samples: float, share: float) -> None:
+    state = SimpleNamespace(joint_power=torch.tensor([[1.0, 2.0, 27.0, 0.0, 0.0, 10.0], [0.0] * 6]))
+    env, world = SimpleNamespace(samples=torch.tensor(samples)), SimpleNamespace(weight=100.0)
+    step: Any = SimpleNamespace(state=state, env=env, world=world)
+    reward = rewards.energy(step, k_energy=-0.3, ramp=(1000.0, 3000.0))
+    torch.testing.assert_close(reward, torch.tensor([share * -0.3 * 0.4, 0.0]))
 
 
 def test_only_a_fall_costs() -> None:
-    torch.testing.assert_close(termination(torch.tensor([True, False]), -1.0), torch.tensor([-1.0, 0.0]))
+    step: Any = SimpleNamespace(fallen=torch.tensor([True, False]))
+    torch.testing.assert_close(rewards.termination(step, k_termination=-1.0), torch.tensor([-1.0, 0.0]))
 
 
-def test_tracking_rewards_are_largest_at_the_command() -> None:
-    command = torch.tensor([[0.7, 0.1, 0.2]]).expand(256, -1)
-    velocity = torch.randn(256, 3, generator=torch.Generator().manual_seed(0))
-    assert (velocity_tracking(velocity, command, 0.2, 0.3) < 0.2).all()
-    assert (yaw_rate_tracking(velocity, command, 0.15, 0.2) < 0.15).all()
+TASK = load_task("telebip_flat", ["rewards.foot.gamma=0.5", "rewards.energy.k_energy=-0.3", "rewards.energy.ramp=[0,200]"])
 
 
-CFG = RewardConfig(
-    cmd=CmdRewardConfig(k_xy=0.2, sigma_xy=0.3, k_w=0.15, sigma_w=0.2),
-    diff=DiffRewardConfig(k_diff=-0.02),
-    tq=TqRewardConfig(k_tq=-0.05),
-    foot=FootRewardConfig(k_foot=0.1, gamma=0.5, first="newest", cap=100.0),
-    energy=EnergyRewardConfig(k_energy=-0.3, ramp=(0.0, 0.0)),
-    termination=TerminationRewardConfig(k_termination=-1.0),
-)
-
-
-def one_step() -> StepContext:
-    """0.3 m/s too slow, 0.2 rad/s off, an action 2 away from the last, a saturated knee, 40 W, and a fall."""
-    state = SimState.zeros(1, torch.device("cpu"))
-    state.qvel[0, 5] = 0.2
+def one_step(robot: Robot) -> Step:
+    """0.3 m/s too slow, 0.2 rad/s off, an action 2 away from the last, a saturated knee, 40 W, and a fall; phase (1, -1)."""
+    step = make_step(robot, gait_period=0.48)
+    state, env = step.state, step.env
+    env.episode_length.fill_(6)  # a quarter of the period
+    state.qvel[0, 0], state.qvel[0, 5] = 0.4, 0.2
+    env.command.copy_(torch.tensor([[0.7, 0.0, 0.0]]))
     state.joint_force[0, 2] = 400.0
-    state.joint_power[0] = torch.tensor([1.0, 2.0, 27.0, 0.0, 0.0, 10.0])
-    return StepContext(
-        state=state,
-        base_lin_vel_b=torch.tensor([[0.4, 0.0, 0.0]]),
-        command=torch.tensor([[0.7, 0.0, 0.0]]),
-        action=torch.tensor([[0.0, 0.0, 1.0, 0.0, 0.0, 0.0]]),
-        last_action=torch.tensor([[0.0, 0.0, -1.0, 0.0, 0.0, 0.0]]),
-        force_limit=FORCE_LIMIT,
-        weight=100.0,
-        foot_window=torch.tensor([[1.0, 2.0]]),
-        foot_weights=torch.tensor([1.0, 0.5]),
-        energy_share=torch.tensor(0.5),
-        fallen=torch.tensor([True]),
-    )
+    state.joint_power[0] = torch.tensor([1.0, 2.0, 27.0, 0.0, 0.0, 10.0]) * step.world.weight / 100.0
+    state.foot_force[0, 0] = step.world.weight
+    step.action[0, 2], env.last_action[0, 2] = 1.0, -1.0
+    env.samples.fill_(100.0)  # half of the ramp
+    step.fallen.fill_(True)
+    return step
 
 
-def test_table_gives_the_modules_of_the_article_and_half_of_the_energy_term() -> None:
-    values = {name: term(one_step(), CFG).item() for name, term in REWARDS.items()}
+def evaluate(step: Step, name: str) -> float:
+    """A term of the published task, the last foot samples being 0 and 2."""
+    term = bind(step, "reward", name, **TASK.rewards[name])
+    if name == "foot":
+        step.env.memory["rewards.foot"]["window"][0, 0] = 2.0
+    return term(step).item()
+
+
+def test_the_published_task_gives_the_modules_of_the_article_and_the_energy_term(robot: Robot) -> None:
+    step = one_step(robot)
+    values = {name: evaluate(step, name) for name in TASK.rewards}
     article = {"cmd": 0.35 / math.e, "diff": -0.04, "tq": -0.05, "foot": 0.2, "termination": -1.0}
-    assert values == pytest.approx(article | {"energy": 0.5 * -0.3 * 0.4})
+    assert values == pytest.approx(article | {"energy": 0.5 * -0.3 * 0.4}, rel=1e-5)
 
 
-def test_table_has_one_row_per_section_of_the_configuration() -> None:
-    assert [*REWARDS, "extra"] == [field.name for field in dataclasses.fields(RewardConfig)]
+def test_the_published_task_names_every_reward_of_telebip() -> None:
+    own = {name for name, term in TERMS["reward"].items() if term.function.__module__ == rewards.__name__}
+    assert set(TASK.rewards) == own
+    assert {name: set(params) for name, params in TASK.rewards.items()} == {
+        name: set(TERMS["reward"][name].parameters) for name in own
+    }
 
 
-@pytest.mark.parametrize("name", list(REWARDS))
-def test_terms_do_not_change_what_they_are_given(name: str) -> None:
-    context, untouched = one_step(), one_step()
-    REWARDS[name](context, CFG)
-    for field in dataclasses.fields(StepContext):
-        if isinstance(value := getattr(context, field.name), torch.Tensor):
-            assert torch.equal(value, getattr(untouched, field.name))
-    for field in dataclasses.fields(SimState):
-        assert torch.equal(getattr(context.state, field.name), getattr(untouched.state, field.name))
+@pytest.mark.parametrize("name", list(TASK.rewards))
+def test_terms_do_not_change_what_they_are_given(robot: Robot, name: str) -> None:
+    step, untouched = one_step(robot), one_step(robot)
+    evaluate(step, name)
+    assert torch.equal(step.action, untouched.action)
+    assert torch.equal(step.fallen, untouched.fallen)
+    after = dict(step.env.items())
+    for part, value in untouched.env.items():
+        assert torch.equal(after[part], value)
+    for part in (lambda state: state.qpos, lambda state: state.qvel):
+        assert torch.equal(part(step.state), part(untouched.state))
+    for part, value in untouched.state.step_values.items():
+        assert torch.equal(step.state.step_values[part], value)

@@ -45,7 +45,7 @@ class Training:
         step = self.env.step
 
         def stepped(actions: Tensor):
-            before_step(int(self.env.num_steps))
+            before_step(int(self.env.state.num_steps))
             return step(actions)
 
         self.env.step = stepped  # type: ignore[method-assign]
@@ -136,7 +136,7 @@ def test_another_robot_is_named(robot: Robot, tmp_path: Path) -> None:
     ("overrides", "why"),
     [
         (["num_envs=4"], "the checkpoint's worlds are others: '.*' differs"),
-        (["gait.period=0.6"], "'_foot_window' differs"),
+        (["gait.period=0.6"], "'rewards.foot.window' differs"),
     ],
 )
 def test_other_worlds_start_anew_and_that_is_said(robot: Robot, tmp_path: Path, overrides: list[str], why: str) -> None:
@@ -161,7 +161,7 @@ def test_worlds_of_another_kind_of_device_start_anew(robot: Robot, tmp_path: Pat
 def test_a_copied_state_keeps_its_command_and_its_place_in_the_curriculum(robot: Robot) -> None:
     first, second = (TelebipEnv(load_task("telebip_efficient", ["num_envs=2"]), robot, "cpu", "native") for _ in range(2))
     first.set_command(0.7, 0.0, 0.0)
-    first.set_progress(6.5e6)
+    first.set_samples(6.5e6)
     second.load_state_dict(first.state_dict())
     for _ in range(2):
         ours, theirs = first.step(torch.zeros(2, 6)), second.step(torch.zeros(2, 6))
@@ -171,7 +171,7 @@ def test_a_copied_state_keeps_its_command_and_its_place_in_the_curriculum(robot:
 
 @pytest.mark.parametrize("backend", ["native", "warp"])
 def test_a_copied_state_goes_on_bit_for_bit(robot: Robot, backend: Backend) -> None:
-    config = load_task("telebip_flat", ["num_envs=8", "episode.length=0.3", "disturbance.push.interval=[0.1,0.2]"])
+    config = load_task("telebip_flat", ["num_envs=8", "episode.length=0.3", "events.push.interval=[0.1,0.2]"])
     first = TelebipEnv(config, robot, "cpu", backend)
     actions = 0.5 * torch.randn(40, 8, 6, generator=torch.Generator().manual_seed(0))
     for action in actions[:20]:

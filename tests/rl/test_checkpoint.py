@@ -1,18 +1,23 @@
 """Checkpoints come back as they were written; whatever else a file holds is one line to the user and is never run."""
 
 import pickle
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 
 from telebip import ROOT
 from telebip.config import TaskConfig, load_task
 from telebip.errors import UserError
-from telebip.mdp.observations import LAYOUT
-from telebip.rl.checkpoint import FORMAT, load_checkpoint, save_checkpoint
+from telebip.mdp.term import TERMS, observation, reward
+from telebip.rl.checkpoint import FORMAT, Checkpoint, load_checkpoint, save_checkpoint
+from telebip.rl.policy import load_policy
+from telebip.rl.resume import require_complete
 
 
 @pytest.fixture
@@ -25,8 +30,27 @@ def learner() -> dict[str, Any]:
     return {"actor_state_dict": weights, "optimizer_state_dict": {"state": {}, "param_groups": [{"lr": 2e-4}]}}
 
 
+LAYOUT = {"policy": [{"name": "phase", "size": 2, "unit": "-", "mirror": ([1, 0], [1.0, 1.0])}]}
+
+
+def checkpoint(path: Path, config: TaskConfig, iteration: int = 7) -> Checkpoint:
+    return Checkpoint(
+        path=path,
+        task="telebip_slow",
+        config=config,
+        iteration=iteration,
+        samples=100 * iteration,
+        observations=LAYOUT,
+        joint_names=["right_knee", "left_knee"],
+        joint_mirror=([1, 0], [1.0, 1.0]),
+        learner=learner(),
+        training=[],
+        robot={"weight": [133.4]},
+    )
+
+
 def write(path: Path, config: TaskConfig, iteration: int = 7) -> Path:
-    save_checkpoint(path, "telebip_slow", config, iteration, 100 * iteration, learner())
+    save_checkpoint(checkpoint(path, config, iteration))
     return path
 
 
@@ -44,7 +68,9 @@ def test_a_checkpoint_comes_back_as_it_was_written(tmp_path: Path, config: TaskC
     path = write(tmp_path / "model_7.pt", config)
     loaded = load_checkpoint(path)
     assert (loaded.path, loaded.task, loaded.iteration, loaded.samples) == (path, "telebip_slow", 7, 700)
-    assert loaded.config == config
+    assert (loaded.config, loaded.observations, loaded.robot) == (config, LAYOUT, {"weight": [133.4]})
+    assert (loaded.joint_names, loaded.joint_mirror) == (["right_knee", "left_knee"], ([1, 0], [1.0, 1.0]))
+    assert (loaded.missing, loaded.training) == ((), [])
     assert set(loaded.learner) == {"actor_state_dict", "optimizer_state_dict"}
     for name, weight in learner()["actor_state_dict"].items():
         assert torch.equal(loaded.learner["actor_state_dict"][name], weight)
@@ -158,21 +184,71 @@ def edited(path: Path, config: TaskConfig, changes: dict[str, Any]) -> Path:
 
 
 def test_another_format_is_refused(tmp_path: Path, config: TaskConfig) -> None:
-    message = refusal(edited(tmp_path / "model_1.pt", config, {"format": "telebip-checkpoint-9"}))
-    assert "telebip-checkpoint-9" in message
-    assert FORMAT in message
+    for other in ("telebip-checkpoint-1", "telebip-checkpoint-9"):
+        message = refusal(edited(tmp_path / "model_1.pt", config, {"format": other}))
+        assert f"has format '{other}', this version reads '{FORMAT}'" in message
 
 
-@pytest.mark.parametrize(
-    ("part", "layout"),
-    [("observation", {**LAYOUT, "phase": 3}), ("action", ["left_knee", "right_knee"])],
-)
-def test_another_layout_is_refused(tmp_path: Path, config: TaskConfig, part: str, layout: Any) -> None:
-    message = refusal(edited(tmp_path / "model_1.pt", config, {part: layout}))
-    assert f"{part} layout" in message
+@pytest.fixture
+def own_terms() -> Iterator[None]:
+    before = {kind: dict(terms) for kind, terms in TERMS.items()}
+    yield
+    for kind, terms in before.items():
+        TERMS[kind].clear()
+        TERMS[kind].update(terms)
 
 
-@pytest.mark.parametrize("entry", ["task", "config", "observation", "action", "iteration", "samples"])
+def test_terms_that_are_unknown_here_are_left_out_and_named(tmp_path: Path, own_terms: None) -> None:
+    @reward
+    def level(step, *, k: float):
+        return k * step.time
+
+    @observation(unit="s")
+    def clock(step):
+        return step.time[:, None]
+
+    config = load_task("telebip_flat", ["rewards.level.k=0.5", "observations.critic={phase: {}, clock: {}}"])
+    path = write(tmp_path / "model_7.pt", config)
+    assert load_checkpoint(path).missing == ()
+    require_complete(load_checkpoint(path))
+    del TERMS["reward"]["level"], TERMS["observation"]["clock"]
+    loaded = load_checkpoint(path)
+    assert set(loaded.missing) == {"rewards.level", "observations.critic.clock"}
+    assert "level" not in loaded.config.rewards
+    assert loaded.config.rewards["cmd"] == config.rewards["cmd"]
+    with pytest.raises(UserError, match=r"model_7.pt' cannot be resumed without .*rewards\.level.*: go on with the program"):
+        require_complete(loaded)
+
+
+def test_a_policy_that_sees_an_unknown_term_is_refused(tmp_path: Path, own_terms: None) -> None:
+    @observation(unit="s")
+    def clock(step):
+        return step.time[:, None]
+
+    path = write(tmp_path / "model_7.pt", load_task("telebip_flat", ["observations.policy.clock={}"]))
+    del TERMS["observation"]["clock"]
+    assert "unknown observation 'clock'" in refusal(path)
+
+
+def test_the_network_has_the_layouts_size(tmp_path: Path, config: TaskConfig) -> None:
+    small = replace(config, ppo=replace(config.ppo, hidden_dims=[4], obs_normalization=False))
+    shapes = {
+        "mlp.0.weight": (4, 2),
+        "mlp.0.bias": (4,),
+        "mlp.2.weight": (2, 4),
+        "mlp.2.bias": (2,),
+        "distribution.std_param": (2,),
+    }
+    weights = {name: torch.ones(shape) for name, shape in shapes.items()}
+    fits = replace(checkpoint(tmp_path / "policy.pt", small), learner={"actor_state_dict": weights})
+    save_checkpoint(fits)
+    action = load_policy(load_checkpoint(tmp_path), "cpu")(TensorDict({"policy": torch.zeros(3, 2)}, batch_size=[3]))
+    assert action.tolist() == [[5.0, 5.0]] * 3  # 4 x elu(1) + 1
+    with pytest.raises(UserError, match="its weights do not fit its configuration"):
+        load_policy(replace(fits, joint_names=["knee"]), "cpu")
+
+
+@pytest.mark.parametrize("entry", ["task", "config", "observations", "joint_names", "joint_mirror", "iteration", "samples"])
 def test_a_missing_entry_is_refused(tmp_path: Path, config: TaskConfig, entry: str) -> None:
     refusal(edited(tmp_path / "model_1.pt", config, {entry: None}))
 
@@ -186,14 +262,17 @@ def test_interrupted_writing_leaves_the_older_file(tmp_path: Path, config: TaskC
     path = write(tmp_path / "model_7.pt", config)
     before = path.read_bytes()
     with pytest.raises(Exception, match=r"pickle|local|lambda"):  # breaks off amidst the writing
-        save_checkpoint(path, "telebip_slow", config, 8, 800, {"weights": torch.zeros(9), "bad": lambda: None})
+        save_checkpoint(replace(checkpoint(path, config, 8), learner={"weights": torch.zeros(9), "bad": lambda: None}))
     assert path.read_bytes() == before
     assert load_checkpoint(tmp_path).iteration == 7
 
 
 @pytest.mark.parametrize(
     ("entry", "value"),
-    [("task", 3), ("iteration", "x"), ("samples", 1.5), ("actor_state_dict", [1]), ("training", 5), ("robot", ["mass"])],
+    [
+        *[("task", 3), ("iteration", "x"), ("samples", 1.5), ("actor_state_dict", [1]), ("training", 5), ("robot", ["mass"])],
+        *[("observations", []), ("joint_names", "knee"), ("joint_mirror", 1.0)],
+    ],
 )
 def test_an_entry_of_another_kind_is_refused(tmp_path: Path, config: TaskConfig, entry: str, value: Any) -> None:
     assert f"its {entry} is no " in refusal(edited(tmp_path / "model_1.pt", config, {entry: value}))

@@ -5,14 +5,15 @@ from pathlib import Path
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from telebip.config import load_task
 from telebip.env import TelebipEnv
-from telebip.rl.benchmark import measure
 from telebip.rl.checkpoint import load_checkpoint
-from telebip.rl.race import RACERS, race
 from telebip.rl.train import Trainer
 from telebip.robot import Robot
+from telebip.tools.benchmark import measure
+from telebip.tools.race import RACERS, race
 
 pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")]
 
@@ -58,18 +59,18 @@ def test_a_policy_acts_alike_on_both_devices(robot: Robot) -> None:
         actor.load_state_dict(checkpoint.learner["actor_state_dict"])
         obs = torch.linspace(-1.0, 1.0, 16 * 33, device=device).view(16, 33)
         with torch.inference_mode():
-            actions.append(actor(env._observed(obs)).cpu())
+            actions.append(actor(TensorDict({"policy": obs}, batch_size=[16])).cpu())
     torch.testing.assert_close(actions[0], actions[1], atol=1e-4, rtol=0.0)
 
 
 def test_the_benchmark_measures(robot: Robot) -> None:
     config, checkpoint = load_task("telebip_flat", ["num_envs=64", "ppo.num_steps_per_env=5"]), load_checkpoint("telebip_flat")
-    row = measure(config, robot, torch.device("cuda:0"), "auto", checkpoint, rounds=2, stock_threads=1)
+    row = measure(config, robot, torch.device("cuda:0"), "auto", checkpoint, rounds=2, with_stock=True)
     assert (row["backend"], row["device"]) == ("warp", "cuda:0")
     assert all(value > 0.0 for seconds in row["rounds_s"] for value in seconds.values())
 
 
 def test_a_race_goes_to_its_end(robot: Robot) -> None:
-    result = race(load_task("telebip_flat", SMALL), robot, torch.device("cuda:0"), "auto", 1280, 1)
+    result = race(load_task("telebip_flat", SMALL), robot, torch.device("cuda:0"), "auto", 1280)
     assert result["samples"] == [640, 1280]
     assert all(math.isfinite(value) for name in RACERS for value in result[name]["episode_return"])

@@ -13,14 +13,15 @@ from tensordict import TensorDict
 
 from telebip import ROOT
 from telebip.config import load_task
+from telebip.env import TelebipEnv
 from telebip.errors import UserError
-from telebip.mdp.mirror import ACTION, OBSERVATION
 from telebip.rl import export as exporting
 from telebip.rl.checkpoint import Checkpoint, load_checkpoint
 from telebip.rl.export import describe, export, largest_difference
 from telebip.rl.onnx import OnnxPolicy
-from telebip.rl.policy import load_network, load_policy
-from telebip.robot import JOINTS, Robot
+from telebip.rl.policy import load_network, load_policy, require_fit
+from telebip.rl.symmetry import SymmetricPolicy
+from telebip.robot import Robot
 
 SHIPPED = ROOT / "assets" / "policies" / "telebip_flat"
 
@@ -53,13 +54,13 @@ def test_normalisation_is_inside(shipped: Checkpoint, exported: Path) -> None:
     assert nodes[:2] == ["Sub", "Div"]
 
 
-def test_a_policy_without_normalisation(tmp_path: Path) -> None:
+def test_a_policy_without_normalisation(shipped: Checkpoint, tmp_path: Path) -> None:
     config = load_task("telebip_flat", ["ppo.obs_normalization=false", "ppo.hidden_dims=[8]"])
     weights = {"mlp.0.weight": (8, 33), "mlp.0.bias": (8,), "mlp.2.weight": (6, 8), "mlp.2.bias": (6,)}
     generator = torch.Generator().manual_seed(1)
     state = {name: torch.randn(shape, generator=generator) for name, shape in weights.items()}
     state["distribution.std_param"] = torch.ones(6)
-    checkpoint = Checkpoint(tmp_path / "model_1.pt", "mine", config, 1, 1, {"actor_state_dict": state})
+    checkpoint = replace(shipped, path=tmp_path / "model_1.pt", task="mine", config=config, learner={"actor_state_dict": state})
     assert export(checkpoint, tmp_path / "policy.onnx", samples=100) < 1e-5
     assert load_checkpoint(tmp_path / "policy.onnx").task == "mine"
 
@@ -71,16 +72,19 @@ def test_a_symmetric_policy_brings_its_mirror(shipped: Checkpoint, tmp_path: Pat
     policy = load_policy(load_checkpoint(tmp_path / "policy.onnx"), "cpu")
     obs = torch.randn(100, 33, generator=torch.Generator().manual_seed(5))
     obs[:, 32] = -obs[:, 31]  # p_l = -p_r
-    (index, sign), (action_index, action_sign) = OBSERVATION, ACTION
+    network = load_network(symmetric)
+    assert isinstance(network, SymmetricPolicy)
     action = policy(TensorDict({"policy": obs}, batch_size=[100]))
-    mirrored = policy(TensorDict({"policy": obs[:, index] * sign}, batch_size=[100]))
-    torch.testing.assert_close(mirrored, action[:, action_index] * action_sign, atol=1e-5, rtol=1e-5)
+    mirrored = policy(TensorDict({"policy": network.canonical.groups["policy"](obs)}, batch_size=[100]))
+    torch.testing.assert_close(mirrored, network.canonical.joints(action), atol=1e-5, rtol=1e-5)
 
 
 def test_the_description_is_complete_and_true(exported: Path, shipped: Checkpoint, robot: Robot) -> None:
     texts = onnxruntime.InferenceSession(str(exported)).get_modelmeta().custom_metadata_map  # as anyone would read it
     about = {key: json.loads(text) for key, text in texts.items()}
-    assert about["joint_names"] == list(JOINTS)
+    assert about["joint_names"] == [
+        f"{side}_{joint}" for side in ("right", "left") for joint in ("hip_roll", "hip_pitch", "knee")
+    ]
     assert about["joint_unit"] == ["rad", "rad", "m"] * 2
     assert about["nominal_pose"] == [0.0, 0.0, 0.04] * 2
     assert about["action_scale"] == [0.25, 0.5, 0.1] * 2
@@ -91,6 +95,7 @@ def test_the_description_is_complete_and_true(exported: Path, shipped: Checkpoin
     assert [(part["name"], part["size"]) for part in about["observation"]][:2] == [("joint_pos", 6), ("joint_vel", 6)]
     assert sum(part["size"] for part in about["observation"]) == 33
     assert all(part["scale"] == 1.0 and part["unit"] for part in about["observation"])
+    assert about["history"] == 1
     assert (about["physics_dt"], about["step_dt"], about["gait_period"]) == (0.005, 0.02, 0.5)
     assert about["command_range"] == {"lin_vel_x": [0.4, 1.0], "lin_vel_y": [0.0, 0.0], "ang_vel_z": [-0.2, 0.2]}
     assert about["training_git_revision"] == json.loads((SHIPPED / "run.json").read_text())["starts"][-1]["git_revision"]
@@ -138,13 +143,17 @@ def test_files_that_are_no_policy(tmp_path: Path, exported: Path) -> None:
         load_checkpoint(tmp_path / "foreign.onnx")
 
 
-def test_a_file_that_sees_something_else(tmp_path: Path, exported: Path) -> None:
-    model = onnx.load(exported)
-    (names,) = (p for p in model.metadata_props if p.key == "joint_names")
-    names.value = json.dumps([*JOINTS[:5], "left_ankle"])
-    onnx.save(model, tmp_path / "other.onnx")
-    with pytest.raises(UserError, match=r"action layout .*left_ankle.* differs"):
-        load_checkpoint(tmp_path / "other.onnx")
+def test_a_policy_of_another_robot_is_refused(shipped: Checkpoint, exported: Path, robot: Robot, tmp_path: Path) -> None:
+    other = replace(shipped, joint_names=[*shipped.joint_names[:5], "left_ankle"])
+    with pytest.raises(UserError, match=r"has joints .*left_knee.*; the policy moves .*left_ankle"):
+        export(other, tmp_path / "policy.onnx")
+    env = TelebipEnv(load_task("telebip_flat", ["num_envs=1"]), robot)
+    require_fit(load_checkpoint(exported), env)
+    with pytest.raises(UserError, match=r"trained on another robot than .*: it moves the joints .*left_ankle, not .*left_knee"):
+        require_fit(other, env)
+    more = TelebipEnv(load_task("telebip_flat", ["num_envs=1", "observations.policy.history=2"]), robot)
+    with pytest.raises(UserError, match=r"sees observations\.policy as .*phase \(2\); here it is .*phase \(2\), 2 times$"):
+        require_fit(shipped, more)
 
 
 def test_a_folder_that_is_not_there(shipped: Checkpoint, tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from telebip.rl.checkpoint import load_checkpoint
 
 SMALL = ("num_envs=16", "ppo.num_steps_per_env=10", "ppo.hidden_dims=[32,16]", "episode.length=0.5", "ppo.save_interval=2")
 """Episodes that end by falls and by time-outs, pushes and commands that change, within a few iterations."""
-BUSY = ("disturbance.push.interval=[0.1,0.3]", "command.resampling_time=0.2", "ppo.symmetry=phase")
+BUSY = ("events.push.interval=[0.1,0.3]", "commands.resampling_time=0.2", "ppo.symmetry=phase")
 
 
 class Training:
@@ -309,7 +309,7 @@ def test_a_damaged_newest_checkpoint_is_named_and_the_one_before_used(tmp_path: 
     Training(tmp_path, *new(tmp_path, 4)).finish()
     newest = run_dir(tmp_path) / "model_4.pt"
     content = bytearray(newest.read_bytes())
-    content[len(content) // 2] ^= 1
+    content[content.index(b"optimizer_state_dict")] ^= 1
     newest.write_bytes(bytes(content))
     with pytest.raises(UserError, match="is damaged"):
         load_checkpoint(newest)

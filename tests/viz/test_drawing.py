@@ -9,9 +9,8 @@ from matplotlib.figure import Figure
 
 from telebip.config import load_task
 from telebip.errors import UserError
-from telebip.eval.rollout import Rollout
-from telebip.mdp.rewards import REWARDS
 from telebip.robot import Robot
+from telebip.rollout import Rollout
 from telebip.viz.drawing import AXIS_COLORS, LEARNING, draw_control_loop, draw_learning, draw_robot, draw_stride
 from telebip.viz.scene import line_up
 
@@ -27,21 +26,24 @@ def words(figure: Figure) -> str:
 
 
 def test_the_control_loop_has_the_tasks_numbers(robot: Robot) -> None:
-    text = words(draw_control_loop(load_task("telebip_flat"), robot))
-    for part in ("50 Hz", "200 Hz, 4 steps of 5 ms", "observation (33)", "base quat 4", "512-256-128", *REWARDS):
+    task, observation = load_task("telebip_flat"), {"joint_pos": 6, "projected_gravity": 3, "command": 3}
+    text = words(draw_control_loop(task, robot, observation))
+    observed = "observation (12)\njoint pos 6, projected gravity 3\ncommand 3"
+    for part in ("50 Hz", "200 Hz, 4 steps of 5 ms", observed, "6 joint\n", "512-256-128", *task.rewards):
         assert part in text
-    other = words(draw_control_loop(load_task("telebip_flat", ["sim.decimation=2", "ppo.hidden_dims=[64]"]), robot))
+    other = load_task("telebip_flat", ["sim.decimation=2", "ppo.hidden_dims=[64]"])
+    other = words(draw_control_loop(other, robot, observation))
     for part in ("100 Hz", "200 Hz, 2 steps of 5 ms", "\n64\n"):
         assert part in other
 
 
-def test_a_stride_is_the_end_of_the_walk(walking: Rollout) -> None:
-    figure = draw_stride(line_up([("RL", walking)])[0], seconds=1.0)
+def test_a_stride_is_the_end_of_the_walk(walking: Rollout, robot: Robot) -> None:
+    figure = draw_stride(line_up([("RL", walking)])[0], robot, seconds=1.0)
     panels = {axes.get_title(loc="left"): axes for axes in figure.axes}
     assert len(panels) == 6
     (right,) = [line for line in panels["knee [m]"].lines if line.get_label() == "right"]
     np.testing.assert_array_equal(right.get_ydata(), walking.qpos[-50:, 0, 9])
-    assert [line.get_label() for line in panels["reward per step"].lines] == [*REWARDS, "total"]
+    assert [line.get_label() for line in panels["reward per step"].lines] == [*walking.reward_names, "total"]
 
 
 def test_learning_curves_are_drawn_over_samples() -> None:

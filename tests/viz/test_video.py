@@ -12,8 +12,8 @@ from PIL import Image
 
 from telebip import ROOT
 from telebip.errors import UserError
-from telebip.eval.rollout import Rollout
 from telebip.robot import Robot, load_robot
+from telebip.rollout import Rollout
 from telebip.viz import opengl
 from telebip.viz.picture import strobe
 from telebip.viz.render import Renderer

@@ -32,7 +32,7 @@ def policy() -> Zero:
 
 @pytest.fixture
 def steering(make_env: Callable[..., TelebipEnv], policy: Zero) -> Steering:
-    env = make_env("episode.reset_heading=0", num_envs=1, calm=True)
+    env = make_env("events.start_pose.heading=0", num_envs=1, calm=True)
     env.set_command(0.5, 0.0, 0.0)
     steering = Steering(env, policy)
     steering.step()
@@ -53,7 +53,7 @@ def test_arrow_keys_change_the_command(steering: Steering, keys: list[int], comm
     for key in keys:
         steering.press(key)
     steering.step()
-    torch.testing.assert_close(steering.env.target_command, torch.tensor([command]))
+    torch.testing.assert_close(steering.env.state.target_command, torch.tensor([command]))
 
 
 def test_enter_pushes_for_a_tenth_of_a_second_from_either_side(steering: Steering) -> None:
@@ -62,7 +62,7 @@ def test_enter_pushes_for_a_tenth_of_a_second_from_either_side(steering: Steerin
         steering.press(ENTER)
         for _ in range(7):
             steering.step()
-            pushes.append(steering.env.push_wrench_w[0, 1].item())
+            pushes.append(steering.env.state.wrench_w[0, 1].item())
     assert pushes == [-PUSH_FORCE] * 5 + [0.0, 0.0] + [PUSH_FORCE] * 5 + [0.0, 0.0]
 
 
@@ -92,9 +92,13 @@ def test_backspace_starts_anew_even_in_a_pause(steering: Steering, policy: Zero)
     assert policy.resets == 1
     steering.press(BACKSPACE)
     steering.step()
-    assert policy.resets == 2
     assert steering.env.episode_length_buf.item() == 0
     assert (steering.command, steering.push) == ([0.5, 0.0, 0.0], 0.0)
+    steering.press(SPACE)
+    steering.step()
+    assert policy.resets == 2
+    assert steering.env.episode_length_buf.item() == 1
+    assert steering.env.state.wrench_w.abs().max() == 0.0
 
 
 def test_numbers_are_of_the_last_second(steering: Steering) -> None:

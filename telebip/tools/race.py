@@ -16,10 +16,11 @@ import torch
 
 from telebip.config import TaskConfig
 from telebip.env import TelebipEnv
-from telebip.rl.benchmark import StockTrainer
-from telebip.rl.train import Trainer, random_state, set_random_state
+from telebip.rl.process import random_state, set_random_state
+from telebip.rl.train import Trainer
 from telebip.robot import Robot
 from telebip.sim import Backend
+from telebip.tools.stock import StockTrainer
 
 Curve = dict[str, list[float | None]]
 RACERS = {"telebip": Trainer, "stock": StockTrainer}
@@ -31,7 +32,6 @@ def race(
     device: torch.device,
     backend: Backend,
     samples: int,
-    stock_threads: int,
     progress: Callable[[], None] = lambda: None,
 ) -> dict[str, Any]:
     """Train with both for `samples` environment steps each, rounded up to whole iterations.
@@ -42,18 +42,16 @@ def race(
         device: where to train.
         backend: physics engine, see `telebip.sim.make_simulator`.
         samples: length of each training.
-        stock_threads: threads of torch for rsl-rl's PPO.
         progress: called after each iteration of both.
 
     Returns:
-        Ready for JSON: `seed`, the engine `backend`, the arithmetic of telebip's `update`, `samples` after each iteration, and
+        Ready for JSON: `seed`, the engine `backend`, the `arithmetic` of both, `samples` after each iteration, and
         for both racers `episode_return`, `episode_length` [policy steps], which are None before an episode has ended, and
         `seconds` of each iteration.
 
     Raises:
         UserError: a training cannot go on, see `Trainer.learn`.
     """
-    threads = {"telebip": torch.get_num_threads(), "stock": stock_threads}
     racers: dict[str, Trainer] = {}
     random = {}  # each racer's own random numbers
     for name, trainer in RACERS.items():
@@ -65,18 +63,16 @@ def race(
     while not at or at[-1] < samples:
         for name, racer in racers.items():
             set_random_state(random[name], device)
-            torch.set_num_threads(threads[name])
             scalars = racer.iterate()
             random[name] = random_state(device)
             for key in ("episode_return", "episode_length"):
                 value = scalars[f"train/{key}"]
                 curves[name][key].append(None if math.isnan(value) else value)
             curves[name]["seconds"].append(scalars["speed/collect_s"] + scalars["speed/learn_s"])
-        torch.set_num_threads(threads["telebip"])
         at.append(racers["telebip"].samples)
         progress()
     own = racers["telebip"]
-    return {"seed": cfg.seed, "backend": own.env.sim.backend, "update": own.arithmetic, "samples": at, **curves}
+    return {"seed": cfg.seed, "backend": own.env.sim.backend, "arithmetic": own.arithmetic, "samples": at, **curves}
 
 
 def verdict(races: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -100,3 +96,12 @@ def verdict(races: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "overlap": max(low for low, _ in interval.values()) <= min(high for _, high in interval.values()),
         "train_over_stock": median(ratios),
     }
+
+
+def sentence(found: dict[str, Any]) -> str:
+    """Return a verdict in words."""
+    intervals = found["episode_return"].values()
+    own, stock = (f"{low:.2f}" if low == high else f"{low:.2f} to {high:.2f}" for low, high in intervals)
+    meet = "they overlap" if found["overlap"] else "they do not overlap"
+    meet = f" ({meet})" if any(low < high for low, high in intervals) else ""
+    return f"return {own}, rsl-rl's {stock}{meet}; {found['train_over_stock']:.2f} times as fast"

@@ -5,13 +5,14 @@ from pathlib import Path
 import pytest
 import torch
 from rsl_rl.algorithms import PPO
+from rsl_rl.storage import RolloutStorage
 
 from telebip.config import load_task
 from telebip.env import TelebipEnv
-from telebip.rl.benchmark import StockTrainer
-from telebip.rl.race import RACERS, race, verdict
 from telebip.rl.train import Trainer
 from telebip.robot import Robot
+from telebip.tools.race import RACERS, race, verdict
+from telebip.tools.stock import StockTrainer
 
 SMALL = ("num_envs=8", "ppo.num_steps_per_env=10", "ppo.hidden_dims=[16,16]", "episode.length=0.2", "seed=4")
 
@@ -19,7 +20,7 @@ SMALL = ("num_envs=8", "ppo.num_steps_per_env=10", "ppo.hidden_dims=[16,16]", "e
 def test_both_train_for_as_many_samples_as_asked_for(robot: Robot) -> None:
     rounds = []
     config = load_task("telebip_flat", SMALL)
-    result = race(config, robot, torch.device("cpu"), "native", 161, 1, lambda: rounds.append(1))
+    result = race(config, robot, torch.device("cpu"), "native", 161, lambda: rounds.append(1))
     assert result["samples"] == [80, 160, 240]
     assert len(rounds) == 3
     assert (result["seed"], result["backend"]) == (4, "native")
@@ -30,21 +31,24 @@ def test_both_train_for_as_many_samples_as_asked_for(robot: Robot) -> None:
     assert result["telebip"] != result["stock"]
 
 
-def test_a_racer_learns_what_it_learns_alone(robot: Robot) -> None:
-    config = load_task("telebip_flat", SMALL)
-    raced = race(config, robot, torch.device("cpu"), "native", 240, torch.get_num_threads())
+@pytest.mark.parametrize("precision", ["never", "always"])
+def test_a_racer_learns_what_it_learns_alone(robot: Robot, precision: str) -> None:
+    config = load_task("telebip_flat", [*SMALL, f"ppo.mixed_precision={precision}"])
+    raced = race(config, robot, torch.device("cpu"), "native", 240)
     for name, racer in RACERS.items():
         alone = racer(TelebipEnv(config, robot, "cpu", "native"), "", Path())
         returns = [alone.iterate()["train/episode_return"] for _ in range(3)]
         assert raced[name]["episode_return"] == returns
 
 
-def test_the_stock_racer_is_rsl_rls_own(robot: Robot) -> None:
-    config = load_task("telebip_flat", [*SMALL, "ppo.mixed_precision=always"])
+@pytest.mark.parametrize("precision", ["never", "always"])
+def test_the_stock_racer_is_rsl_rls_own_on_the_same_networks(robot: Robot, precision: str) -> None:
+    config = load_task("telebip_flat", [*SMALL, f"ppo.mixed_precision={precision}"])
     own, stock = (racer(TelebipEnv(config, robot, "cpu", "native"), "", Path()).learner for racer in (Trainer, StockTrainer))
-    assert own.use_mixed_precision
     assert type(stock) is PPO
-    assert not stock.use_mixed_precision
+    assert type(stock.storage) is RolloutStorage
+    assert type(stock.optimizer) is torch.optim.Adam and not stock.optimizer.defaults["fused"]
+    assert type(own.actor) is type(stock.actor)
 
 
 def racer(last_return: float, *seconds: float) -> dict[str, list[float]]:

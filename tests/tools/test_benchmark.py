@@ -1,5 +1,6 @@
-"""The benchmark measures what it says: every rung goes over the same walk."""
+"""The benchmark measures what it says: every stage goes over the same walk."""
 
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 
 import pytest
@@ -10,14 +11,24 @@ from worlds import MakeEnv, put_low, random_actions
 from telebip.config import load_task
 from telebip.env import TelebipEnv
 from telebip.errors import UserError
-from telebip.rl import benchmark
-from telebip.rl.benchmark import Ladder, allocated_bytes, recorded, summary
 from telebip.rl.checkpoint import load_checkpoint
 from telebip.robot import Robot
+from telebip.tools import benchmark
+from telebip.tools.benchmark import Stages, summary
+from telebip.tools.engines import BareEngine, recorded
+from telebip.tools.measuring import allocated_bytes
 
 
-def test_a_recorded_walk_can_be_gone_over_again(make_env: MakeEnv) -> None:
-    env = make_env("disturbance.push.interval=[0.02,0.06]", num_envs=8)
+@pytest.fixture
+def several_threads() -> Iterator[Callable[[int], None]]:
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("backend", ["native", "warp"])
+def test_a_recorded_walk_can_be_gone_over_again(make_env: MakeEnv, backend: str) -> None:
+    env = make_env("events.push.interval=[0.02,0.06]", num_envs=8, backend=backend)
     put_low(env, [2])  # it falls at the first step, and starts anew
     start = env.state_dict()
     with recorded(env) as (actions, calls):
@@ -30,14 +41,20 @@ def test_a_recorded_walk_can_be_gone_over_again(make_env: MakeEnv) -> None:
     assert all(torch.equal(a, b) for a, b in zip(walked, again, strict=True))
 
     others = [0, 1, 3, 4, 5, 6, 7]  # worlds that are not reset go from each call of the engine to the next
+    engine = BareEngine(env)
     for call, following in pairwise(calls):
-        call.prepare(env.sim)
-        env.sim.advance()
+        engine.prepare(call)
+        engine.run()
         for name, value in env.sim.memory.items():
             assert torch.equal(value[others], following.memory[name][others]), name
 
 
-def test_every_rung_takes_the_same_actions(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("precision", ["never", "always"])
+def test_every_stage_takes_the_same_actions(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch, several_threads: Callable[[int], None], precision: str, threads: int
+) -> None:
+    several_threads(threads)
     walked: list[Tensor] = []
     step = TelebipEnv.step
 
@@ -46,14 +63,17 @@ def test_every_rung_takes_the_same_actions(robot: Robot, monkeypatch: pytest.Mon
         return step(env, actions)
 
     monkeypatch.setattr(TelebipEnv, "step", noted)
-    config = load_task("telebip_flat", ["num_envs=8", "ppo.num_steps_per_env=10", "ppo.learning_rate=0.01"])
-    ladder = Ladder(config, robot, torch.device("cpu"), "native", load_checkpoint("telebip_flat"), stock_threads=1)
+    own = (f"ppo.mixed_precision={precision}", "ppo.num_steps_per_env=10", "ppo.learning_rate=0.01")
+    config = load_task("telebip_flat", ["num_envs=8", *own])
+    stages = Stages(config, robot, torch.device("cpu"), "native", load_checkpoint("telebip_flat"), with_stock=True)
+    assert stages.arithmetic == ("float32" if precision == "never" else "bfloat16")
     for _ in range(2):
         walked.clear()
-        ladder.round()
-        recording, env, stock, collect = (torch.stack(walked[i : i + 10]) for i in range(0, 40, 10))
-        for rung in (env, stock, collect):
-            assert torch.equal(rung, recording)
+        stages.round()
+        recording, *others = (torch.stack(walked[i : i + 10]) for i in range(0, 40, 10))
+        assert len(others) == 3  # env, stock, collect
+        for stage in others:
+            assert torch.equal(stage, recording)
 
 
 def test_the_summary_is_made_of_medians_over_the_rounds() -> None:
@@ -109,10 +129,10 @@ def test_a_step_leaves_no_memory_behind(make_env: MakeEnv, backend: str) -> None
 def test_worlds_that_do_not_fit_are_told_from_other_errors(
     robot: Robot, monkeypatch: pytest.MonkeyPatch, raised: RuntimeError, seen: type[Exception]
 ) -> None:
-    def no_ladder(*args: object) -> Ladder:
+    def no_stages(*args: object) -> Stages:
         raise raised
 
-    monkeypatch.setattr(benchmark, "Ladder", no_ladder)
+    monkeypatch.setattr(benchmark, "Stages", no_stages)
     config, cpu = load_task("telebip_flat", ["num_envs=8"]), torch.device("cpu")
     with pytest.raises(seen, match="8 worlds do not fit" if seen is UserError else "something else"):
         benchmark.measure(config, robot, cpu, "native", load_checkpoint("telebip_flat"), 1)

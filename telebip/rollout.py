@@ -1,34 +1,62 @@
-"""Walk a policy and keep what happened, as plain arrays for measuring, plotting and recording."""
+"""Walk a policy in an environment: the one loop for it, and what happened as plain arrays for measuring and drawing."""
 
 import dataclasses
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from tensordict import TensorDict
 from torch import Tensor
 
 from telebip.control.policy import Policy
 from telebip.env import TelebipEnv
 from telebip.errors import UserError
-from telebip.sim import SimState
+
+
+class Stride(NamedTuple):
+    """What `TelebipEnv.step` returned for one policy step; the worlds' state is that of the environment."""
+
+    obs: TensorDict
+    rewards: Tensor  # (num_envs,)
+    dones: Tensor  # bool, (num_envs,)
+    extras: dict[str, Any]
+
+
+@torch.inference_mode()
+def walk(env: TelebipEnv, policy: Policy) -> Iterator[Stride]:
+    """Walk `policy` from the environment's present state, without end; yield after every policy step.
+
+    Between steps the caller may give commands (`env.set_command`) and push (`env.push`). To start anew, reset the environment
+    and walk again. Worlds that end are reset and go on; the policy's memory is cleared with them, and of all worlds at first.
+    """
+    policy.reset(torch.ones(env.num_envs, dtype=torch.bool, device=env.device))
+    obs = env.get_observations()
+    while True:
+        stride = Stride(*env.step(policy(obs)))
+        policy.reset(stride.dones)
+        obs = stride.obs
+        yield stride
 
 
 @dataclass(frozen=True)
 class Rollout:
-    """One row per policy step, in the order of `telebip.robot.JOINTS`. Where a world fell, its row shows its new start."""
+    """One row per policy step, joints in the order of `joint_names`. Where a world fell, its row shows its new start."""
 
     step_dt: float  # [s]
     weight: float  # m g of the robot [N]
+    joint_names: tuple[str, ...]  # of the actuated joints
     reward_names: tuple[str, ...]  # of the terms in `reward_terms`
-    qpos: NDArray[np.float32]  # (steps, num_envs, 13), as in SimState
-    qvel: NDArray[np.float32]  # (steps, num_envs, 12), as in SimState
-    joint_target: NDArray[np.float32]  # (steps, num_envs, 6) [rad | m]
-    joint_force: NDArray[np.float32]  # (steps, num_envs, 6), mean over the step [N m | N]
-    joint_power: NDArray[np.float32]  # (steps, num_envs, 6), mean of |force x velocity| over the step [W]
-    joint_net_power: NDArray[np.float32]  # (steps, num_envs, 6), mean of force x velocity over the step [W]
+    qpos: NDArray[np.float32]  # (steps, num_envs, nq), as in SimState
+    qvel: NDArray[np.float32]  # (steps, num_envs, nv), as in SimState
+    joint_pos: NDArray[np.float32]  # (steps, num_envs, num_joints) [rad | m]
+    joint_target: NDArray[np.float32]  # (steps, num_envs, num_joints) [rad | m]
+    joint_force: NDArray[np.float32]  # (steps, num_envs, num_joints), mean over the step [N m | N]
+    joint_power: NDArray[np.float32]  # (steps, num_envs, num_joints), mean of |force x velocity| over the step [W]
+    joint_net_power: NDArray[np.float32]  # (steps, num_envs, num_joints), mean of force x velocity over the step [W]
     foot_force: NDArray[np.float32]  # (steps, num_envs, 2), right and left, mean over the step [N]
     push_w: NDArray[np.float32]  # (steps, num_envs, 3): push on the trunk, world frame [N]
     phase: NDArray[np.float32]  # (steps, num_envs, 2): p_r, p_l
@@ -71,27 +99,42 @@ def roll_out(env: TelebipEnv, policy: Policy, steps: int, progress: Callable[[in
         UserError: the engine had no room for a world's contacts or constraints.
     """
     rows: list[dict[str, Tensor]] = []
-    with torch.inference_mode():
-        policy.reset(torch.ones(env.num_envs, dtype=torch.bool, device=env.device))
-        obs = env.get_observations()
-        for step in range(steps):
-            command = env.target_command.clone()
-            obs, reward, dones, extras = env.step(policy(obs))
-            policy.reset(dones)
-            row = {
-                **{field.name: getattr(env.sim.state, field.name) for field in dataclasses.fields(SimState)},
-                "joint_target": env.joint_target,
-                "phase": env.phase,
-                "reference_heading": env.reference_heading,
-                "push_w": env.push_wrench_w[:, :3],
-                "reward_terms": env.reward_terms.T,
-            }
-            rows.append({name: value.clone() for name, value in row.items()})
-            rows[-1] |= {"command": command, "reward": reward, "fallen": dones & ~extras["time_outs"]}
-            progress(step + 1)
+    walking = walk(env, policy)
+    for step in range(steps):
+        command = env.state.target_command.clone()  # a world that ends may get another one
+        stride = next(walking)
+        rows.append({name: value.clone() for name, value in _row(env, stride).items()} | {"command": command})
+        progress(step + 1)
     judge_faults(env)
     arrays = {name: torch.stack([row[name] for row in rows]).cpu().numpy() for name in rows[0]}
-    return Rollout(step_dt=env.step_dt, weight=env.robot.weight, reward_names=env.reward_names, **arrays)
+    return Rollout(
+        step_dt=env.step_dt,
+        weight=env.robot.weight,
+        joint_names=env.robot.joint_names,
+        reward_names=env.reward_names,
+        **arrays,
+    )
+
+
+def _row(env: TelebipEnv, stride: Stride) -> dict[str, Tensor]:
+    """Return a step's row of the rollout, (num_envs, ...) each, but for the command."""
+    sim, state = env.sim.state, env.state
+    return {
+        "qpos": sim.qpos,
+        "qvel": sim.qvel,
+        "joint_pos": sim.joint_pos,
+        "joint_target": state.joint_target,
+        "joint_force": sim.joint_force,
+        "joint_power": sim.joint_power,
+        "joint_net_power": sim.joint_net_power,
+        "foot_force": sim.foot_force,
+        "push_w": state.wrench_w[:, :3],
+        "phase": env.view().phase,
+        "reference_heading": state.reference_heading,
+        "reward": stride.rewards,
+        "reward_terms": env.reward_terms.T,
+        "fallen": stride.dones & ~stride.extras["time_outs"],
+    }
 
 
 def judge_faults(env: TelebipEnv) -> None:

@@ -1,0 +1,102 @@
+"""Groups of observations: terms side by side, their noise, and what is late or remembered of them."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from telebip.errors import UserError
+from telebip.math import columns
+from telebip.mdp.binding import Binder, Bound, find_term, own
+from telebip.mdp.mirror import Image, image_of
+from telebip.mdp.step import Step
+from telebip.mdp.term import Mirror, ObservationGroup, Params
+
+AXES: dict[Mirror, tuple[str, ...]] = {
+    **{"polar": ("x", "y", "z"), "axial": ("x", "y", "z"), "quat": ("w", "x", "y", "z")},
+    **{"command": ("lin_vel_x", "lin_vel_y", "ang_vel_z"), "feet": ("right", "left")},
+}
+"""What the numbers of a vector are called, by its kind."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """What one term is in a group's vector."""
+
+    name: str
+    size: int
+    unit: str
+    axes: tuple[str, ...]  # names of its numbers
+    image: Image | str  # how it is mirrored, or why it cannot be
+    noise: float  # amplitude, in its unit
+
+
+class Group:
+    """One vector of observations of every world.
+
+    With a `history` of N it is the latest N frames, the newest first, and with a `delay` they are that many policy steps old;
+    where an episode is younger than that, its first frame stands for those before.
+    """
+
+    def __init__(self, name: str, cfg: ObservationGroup, binder: Binder) -> None:
+        """Bind the terms, and find their sizes by observing once."""
+        self.name, self.history, self._delay = name, cfg.history, cfg.delay
+        section, world = f"observations.{name}", binder.step.world
+        self._terms = [binder.bind("observation", section, entry, params) for entry, params in cfg.terms.items()]
+        self.parts = [
+            _part(f"{section}.{entry}", entry, params, cfg.noise, term, binder.step)
+            for term, (entry, params) in zip(self._terms, cfg.terms.items(), strict=True)
+        ]
+        self.frame_size = sum(part.size for part in self.parts)
+        self.size = cfg.history * self.frame_size
+        self._has_noise = any(part.noise for part in self.parts)
+        noise = [(-part.noise, part.noise) for part in self.parts for _ in range(part.size)]
+        late = [(cfg.delay[0], cfg.delay[1] + 1)] if cfg.delay[1] else []
+        self._draws = binder.draws(section, {"noise": noise if self._has_noise else [], "delay": late})
+        kept = cfg.history + cfg.delay[1]
+        frames = {"frames": world.zeros(kept * self.frame_size), "age": world.zeros()}
+        self._memory = binder.memory(section, frames) if kept > 1 else None
+
+    def layout(self) -> list[dict[str, Any]]:
+        """Return what each part of a frame is, as plain data."""
+        return [{"name": part.name, "size": part.size, "unit": part.unit, "mirror": part.image} for part in self.parts]
+
+    def advance(self) -> None:
+        """Make room for the next frame, before the worlds move on."""
+        if self._memory:
+            frames, size = self._memory["frames"], self.frame_size
+            frames.copy_(columns(frames[:, :size], frames[:, :-size]))
+
+    def observe(self, step: Step) -> Tensor:
+        """Return what is seen now, (num_envs, size); seen twice in a step, it is the same."""
+        frame = columns(*(term(step) for term in self._terms))
+        if self._has_noise:
+            frame += self._draws["noise"]
+        if not self._memory:
+            return frame.contiguous()  # by rows, as everyone expects
+        frames, size = self._memory["frames"], self.frame_size
+        kept = frames.shape[1] // size
+        frames[:, :size] = frame
+        frames.copy_(torch.where(step.is_new[:, None], frame.repeat(1, kept), frames))
+        if not self._delay[1]:
+            return frames.contiguous()
+        age = self._memory["age"]
+        torch.where(step.is_new, self._draws["delay"][:, 0].floor(), age, out=age)
+        index = age.long()[:, None] + torch.arange(self.history, device=frame.device)
+        seen = frames.unflatten(1, (kept, size)).gather(1, index[:, :, None].expand(-1, -1, size))
+        return seen.flatten(1).contiguous()
+
+
+def _part(where: str, entry: str, params: Params, has_noise: bool, bound: Bound, step: Step) -> Part:
+    """Return what an entry is, from its term and from what it returns."""
+    value = bound(step)
+    if not isinstance(value, Tensor) or value.dim() != 2 or len(value) != step.world.num_envs:
+        found = tuple(value.shape) if isinstance(value, Tensor) else value
+        raise UserError(f"{where} must return (num_envs, size), got {found}")
+    term, robot, size = find_term("observation", entry, params), step.world.robot, value.shape[1]
+    mirror = term.mirror(**own(term, params)) if callable(term.mirror) else term.mirror
+    names = robot.joint_names if mirror == "joints" else AXES.get(mirror, ())
+    axes = names if len(names) == size else tuple(map(str, range(size)))
+    noise = params["noise"] if has_noise else 0.0
+    return Part(entry, size, term.unit, axes, image_of(mirror, size, robot), noise)

@@ -1,0 +1,75 @@
+"""The networks: rsl-rl's, with matrix products in bfloat16 where that is faster."""
+
+from typing import Any
+
+import torch
+from rsl_rl.models import MLPModel
+from rsl_rl.modules.distribution import GaussianDistribution
+from tensordict import TensorDict
+from torch import Tensor
+
+from telebip.config.schema import PpoConfig
+
+
+class Gaussian(GaussianDistribution):
+    """rsl-rl's Gaussian with a sample that does not wait for CUDA to look whether every deviation is positive."""
+
+    def sample(self) -> Tensor:
+        """Return mean + std * noise, the same numbers as those of `torch.normal`."""
+        return torch.randn_like(self.mean).mul_(self.std).add_(self.mean)
+
+
+class Bfloat16Model(MLPModel):
+    """rsl-rl's network with products in bfloat16: inputs, sums, outputs and weights stay in float32.
+
+    rsl-rl's own `use_mixed_precision` lets the update run in bfloat16 and the rollout in float32. PPO then compares the policy
+    with another rounding of itself: for a trained one, whose deviations are small, their KL divergence is 0.004, of 0.01 that
+    the adaptive schedule aims at. This network rounds alike wherever it is asked, and its distribution and losses are float32.
+    """
+
+    def forward(
+        self, obs: TensorDict, masks: Tensor | None = None, hidden_state: Any = None, stochastic_output: bool = False
+    ) -> Tensor:
+        """Return actions or values, see `MLPModel`."""
+        latent = self.get_latent(obs, masks, hidden_state)
+        with torch.autocast(latent.device.type, torch.bfloat16):
+            output = self.mlp(latent).float()
+        if self.distribution is None:
+            return output
+        if not stochastic_output:
+            return self.distribution.deterministic_output(output)
+        self.distribution.update(output)
+        return self.distribution.sample()
+
+
+def network_class(mixed_precision: str, device: torch.device) -> type[MLPModel]:
+    """Return what actor and critic are made of."""
+    return Bfloat16Model if arithmetic(mixed_precision, device) == "bfloat16" else MLPModel
+
+
+def arithmetic(mixed_precision: str, device: torch.device) -> str:
+    """Return what the networks compute in, bfloat16 or float32; `auto` asks the device whether it has instructions for it."""
+    is_bfloat16 = has_bfloat16(device) if mixed_precision == "auto" else mixed_precision == "always"
+    return "bfloat16" if is_bfloat16 else "float32"
+
+
+def has_bfloat16(device: torch.device) -> bool:
+    """Whether the device multiplies matrices in bfloat16 itself."""
+    if device.type == "cuda":
+        with torch.cuda.device(device):
+            return torch.cuda.is_bf16_supported(including_emulation=False)
+    capabilities = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}
+    return bool(capabilities.get("avx512_bf16") or capabilities.get("amx_bf16"))
+
+
+def actor_cfg(ppo: PpoConfig) -> dict[str, Any]:
+    """Arguments of the actor's `MLPModel`: a Gaussian whose mean is an MLP and whose deviation is a parameter."""
+    return {
+        **critic_cfg(ppo),
+        "distribution_cfg": {"class_name": Gaussian, "init_std": ppo.init_std, "std_range": (ppo.min_std, 1e6)},
+    }
+
+
+def critic_cfg(ppo: PpoConfig) -> dict[str, Any]:
+    """Arguments of the critic's `MLPModel`."""
+    return {"hidden_dims": list(ppo.hidden_dims), "activation": ppo.activation, "obs_normalization": ppo.obs_normalization}
