@@ -231,7 +231,9 @@ def test_a_damaged_fault_is_refused(make_env: MakeEnv, tmp_path: Path) -> None:
         load_fault(path)
 
 
-@pytest.mark.parametrize("missing", ["record", "backend", "config", "model_fields", "action", "targets", "qpos", "geom_friction"])
+@pytest.mark.parametrize(
+    "missing", ["record", "backend", "config", "model_fields", "action", "targets", "qpos", "geom_friction"]
+)
 def test_an_incomplete_fault_is_refused(make_env: MakeEnv, tmp_path: Path, missing: str) -> None:
     env = make_env()
     env.step(torch.full((4, 6), torch.nan))

@@ -105,10 +105,11 @@ def _warp(sim: Any, steps: int) -> tuple:
         with wp.ScopedCapture(device=device) as capture:
             launch()
         wp.synchronize_device(device)
+        graph: Any = capture.graph
 
         def run() -> None:
             with torch.cuda.device(sim.device):  # the default stream's handle means that of the current device
-                wp.capture_launch(capture.graph, stream=wp.stream_from_torch(torch.cuda.current_stream(sim.device)))
+                wp.capture_launch(graph, stream=wp.stream_from_torch(torch.cuda.current_stream(sim.device)))
 
     ctrl, xfrc, overflow = (wp.to_torch(array) for array in (data.ctrl, data.xfrc_applied, data.overflow))
     return ctrl, xfrc, overflow, run

@@ -191,11 +191,11 @@ def test_another_format_is_refused(tmp_path: Path, config: TaskConfig) -> None:
 
 @pytest.fixture
 def own_terms() -> Iterator[None]:
-    before = {kind: dict(terms) for kind, terms in TERMS.items()}
+    before = [(terms, dict(terms)) for terms in TERMS.values()]
     yield
-    for kind, terms in before.items():
-        TERMS[kind].clear()
-        TERMS[kind].update(terms)
+    for terms, own in before:
+        terms.clear()
+        terms.update(own)
 
 
 def test_terms_that_are_unknown_here_are_left_out_and_named(tmp_path: Path, own_terms: None) -> None:

@@ -84,7 +84,7 @@ def test_an_update_equals_rsl_rls(robot: Robot, overrides: tuple[str, ...], prec
 
 
 def test_mini_batches_are_rsl_rls_bit_for_bit(robot: Robot) -> None:
-    storage = rollout(robot, "ppo.num_mini_batches=3")[0].learner.storage
+    storage: Any = rollout(robot, "ppo.num_mini_batches=3")[0].learner.storage
     batches = []
     for kind in (ShuffledStorage, RolloutStorage):
         torch.manual_seed(7)
