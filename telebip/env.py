@@ -10,7 +10,7 @@ from torch import Tensor
 
 from telebip.config import TaskConfig, check
 from telebip.graph import CudaGraph
-from telebip.math import wrap_angle, yaw, zeros
+from telebip.math import wrap_angle, zeros
 from telebip.mdp import log
 from telebip.mdp.actions import DelayLine, joint_targets, scales
 from telebip.mdp.binding import Binder, Events, model_fields_of, sensors_of
@@ -146,7 +146,6 @@ class TelebipEnv(VecEnv):
         self._draws.draw(self.generator)
         self._reset(self._everywhere())
         self.sim.refresh_constants(self._everywhere())
-        self._update_commands()
         return self.get_observations()
 
     def set_command(self, lin_vel_x: float, lin_vel_y: float, ang_vel_z: float) -> None:
@@ -167,9 +166,9 @@ class TelebipEnv(VecEnv):
         """Bring the curriculum to where a training stands after `samples` environment steps; a new one is complete."""
         self.state.samples.fill_(samples)
 
-    def view(self, fallen: Tensor | None = None) -> Step:
+    def view(self) -> Step:
         """Return the present step as terms see it."""
-        return Step(self.world, self.state, self._action, fallen)
+        return Step(self.world, self.state, self._action)
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
         """Apply `actions` (num_envs, num_actions) for one policy step.
@@ -245,9 +244,7 @@ class TelebipEnv(VecEnv):
         if self._keep_final_obs:
             self._hold_heading(step)
             final_obs = self._observe(step)
-        self._reset(dones)
-        self._update_commands()
-        obs = self._observe(self.view())
+        obs = self._observe(self._reset(dones))
         final_obs = {name: torch.where(fault[:, None], obs[name], value) for name, value in final_obs.items()}
         return Outcome(obs, rewards.sum(0), dones, time_outs, logged, final_obs)
 
@@ -325,22 +322,24 @@ class TelebipEnv(VecEnv):
     def _everywhere(self) -> Tensor:
         return torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
 
-    def _reset(self, mask: Tensor) -> None:
-        """Start a new episode in the worlds where `mask` (num_envs,) holds."""
+    def _reset(self, mask: Tensor) -> Step:
+        """Start a new episode in the worlds where `mask` (num_envs,) holds, give new commands, and return the view of it."""
         self.state.reset(mask)
+        before, reference = self.view(), self.state.reference_heading
+        self._events.happen("reset", before, mask)
+        self.sim.reset(mask, before.start_qpos, before.start_qvel)
         step = self.view()
-        self._events.happen("reset", step, mask)
-        self.sim.reset(mask, step.start_qpos, step.start_qvel)
-        heading = self.state.reference_heading
-        torch.where(mask, yaw(step.start_qpos[:, 3:7]), heading, out=heading)
+        torch.where(mask, step.heading, reference, out=reference)
+        self._update_commands(step)
+        return step
 
-    def _update_commands(self) -> None:
+    def _update_commands(self, step: Step) -> None:
         """Give a new command where the last one has expired, and bring the heading hold up to date."""
         state = self.state
         due = (state.command_timer < 0.5 * self.step_dt) & ~state.command_is_fixed
         torch.where(due[:, None], self._drawn_commands["command"], state.target_command, out=state.target_command)
         state.command_timer.masked_fill_(due, self.cfg.commands.resampling_time)
-        self._hold_heading(self.view())
+        self._hold_heading(step)
 
     def _hold_heading(self, step: Step) -> None:
         """Turn the target command's yaw rate towards the reference heading."""

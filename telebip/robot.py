@@ -1,6 +1,7 @@
 # pyright: reportAttributeAccessIssue=false
 """The robot as its MJCF describes it: its actuated joints, nominal pose, limits, feet and mirror image."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -153,30 +154,28 @@ def _check_actuators(model: mujoco.MjModel, path: str | Path) -> None:
         if not on_joint or model.jnt_type[model.actuator_trnid[i, 0]] not in (HINGE, SLIDE):
             raise UserError(f"{path}: actuator '{name}' must drive one joint, a hinge or a slide")
         joint = model.joint(model.actuator_trnid[i, 0])
-        if not joint.name:
-            raise UserError(f"{path}: the joint of actuator '{name}' needs a name")
-        if joint.name in driven:
-            raise UserError(f"{path}: joint '{joint.name}' has a second actuator, '{name}'")
+        for holds, else_wrong in (
+            (joint.name, f"the joint of actuator '{name}' needs a name"),
+            (joint.name not in driven, f"joint '{joint.name}' has a second actuator, '{name}'"),
+            (model.jnt_limited[joint.id], f"joint '{joint.name}' needs a range"),
+            (_is_position(model, i), f"actuator '{name}' must be a position actuator: its control is a joint target"),
+            (
+                model.actuator_dyntype[i] == mujoco.mjtDyn.mjDYN_NONE,
+                f"actuator '{name}' must act at once: no time constant or other activation dynamics",
+            ),
+            (model.actuator_gear[i, 0] == 1.0, f"actuator '{name}' must have a gear of 1"),
+            (model.actuator_forcelimited[i], f"actuator '{name}' needs a forcerange"),
+        ):
+            if not holds:
+                raise UserError(f"{path}: {else_wrong}")
         driven.add(joint.name)
-        if not model.jnt_limited[joint.id]:
-            raise UserError(f"{path}: joint '{joint.name}' needs a range")
-        if not _is_position(model, i):
-            raise UserError(f"{path}: actuator '{name}' must be a position actuator: its control is a joint target")
-        if model.actuator_dyntype[i] != mujoco.mjtDyn.mjDYN_NONE:
-            raise UserError(f"{path}: actuator '{name}' must act at once: no time constant or other activation dynamics")
-        if model.actuator_gear[i, 0] != 1.0:
-            raise UserError(f"{path}: actuator '{name}' must have a gear of 1")
-        if not model.actuator_forcelimited[i]:
-            raise UserError(f"{path}: actuator '{name}' needs a forcerange")
 
 
 def _is_position(model: mujoco.MjModel, i: int) -> bool:
     """Whether an actuator's force is kp (control - position) and what depends on its velocity."""
-    kp = model.actuator_gainprm[i, 0]
-    is_linear = (
-        model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED and model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE
-    )
-    return is_linear and 0 < kp == -model.actuator_biasprm[i, 1]
+    kinds = (model.actuator_gaintype[i], model.actuator_biastype[i])
+    is_linear = kinds == (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_AFFINE)
+    return is_linear and 0 < model.actuator_gainprm[i, 0] == -model.actuator_biasprm[i, 1]
 
 
 def _id(model: mujoco.MjModel, kind: str, name: str, path: str | Path) -> int:
@@ -226,7 +225,10 @@ def _mirror(model: mujoco.MjModel, trunk: int, home: NDArray[np.float64], sites:
         return f"body '{TRUNK}' leans to one side"
     if not _same(data.site_xpos[sites[0]], data.site_xpos[sites[1]] * MIRROR):
         return "places of the feet's touch sensors"
-    names, moments = [model.joint(joint).name for joint in range(model.njnt)], _moments(model, data, data.xpos[trunk])
+    names = [model.joint(joint).name for joint in range(model.njnt)]
+    moments = moments_of_mass(model, data, data.xpos[trunk])
+    for body in reversed(range(1, model.nbody)):  # of each body with all that hangs on it
+        moments[model.body_parentid[body]] += moments[body]
     actuator = {int(joint): i for i, joint in enumerate(model.actuator_trnid[:, 0])}
     order, sign = [0] * len(actuator), [0.0] * len(actuator)
     for i in range(1, model.njnt):
@@ -238,13 +240,11 @@ def _mirror(model: mujoco.MjModel, trunk: int, home: NDArray[np.float64], sites:
         if (i in actuator) != (j in actuator):
             return f"only one actuator on {pair}"
         signed = _axis_sign(model, data, i, j)
-        unlike = _unlike(model, data, moments, i, j, signed)
-        if unlike:
+        if unlike := _unlike(model, data, moments, i, j, signed):
             return f"{unlike} of {pair}"
         if i in actuator:
             a, b = actuator[i], actuator[j]
-            limits = model.actuator_forcerange
-            if not _same(limits[a], np.sort(signed * limits[b])):
+            if not _same(model.actuator_forcerange[a], np.sort(signed * model.actuator_forcerange[b])):
                 return f"force limits of {pair}"
             if not all(_same(prm[a], prm[b]) for prm in (model.actuator_gainprm, model.actuator_biasprm)):
                 return f"gains of {pair}"
@@ -273,40 +273,35 @@ def _unlike(model: mujoco.MjModel, data: mujoco.MjData, moments: NDArray[np.floa
         return "anchors"
     if not _mirrors(moments[model.jnt_bodyid[i]], moments[model.jnt_bodyid[j]]):
         return "masses"
-    columns = model.jnt_qposadr[[i, j], None]
-    for what, (own, others) in {
+    columns, dofs = model.jnt_qposadr[[i, j], None], model.jnt_dofadr[[i, j], None]
+    signed = {
         "home positions": data.qpos[columns],
         "rest positions": model.qpos_spring[columns],
         "ranges": model.jnt_range[[i, j]],
-    }.items():
-        if not _same(own, np.sort(sign * others)):
-            return what
-    dofs = columns - 1
-    for what, (own, others) in {
+    }
+    unsigned = {
         "stiffness": model.jnt_stiffness[[i, j]],
         "damping": model.dof_damping[dofs],
         "friction": model.dof_frictionloss[dofs],
         "armature": model.dof_armature[dofs],
-    }.items():
-        if not _same(own, others):
+    }
+    for what, (own, others) in (signed | unsigned).items():
+        if not _same(own, np.sort(sign * others) if what in signed else others):
             return what
     return ""
 
 
-def _moments(model: mujoco.MjModel, data: mujoco.MjData, origin: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the moments of mass of each body with all that hangs on it, in the world's axes, (nbody, 4, 4).
+def moments_of_mass(model: mujoco.MjModel, data: mujoco.MjData, origin: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the moments of mass of each body in its present pose, in the world's axes, (nbody, 4, 4).
 
         sum m [r r^T  r; r^T  1]                                                            [kg m^2, kg m, kg]
 
-    over all particles, r from `origin` to each.
+    over all particles, r from `origin` to each. Those of several bodies together are their sum.
     """
-    moments = np.zeros((model.nbody, 4, 4))
-    for body in reversed(range(1, model.nbody)):
-        axes, place = data.ximat[body].reshape(3, 3), np.append(data.xipos[body] - origin, 1.0)
-        inertia = model.body_inertia[body]
-        moments[body, :3, :3] += axes * (0.5 * inertia.sum() - inertia) @ axes.T
-        moments[body] += model.body_mass[body] * np.outer(place, place)
-        moments[model.body_parentid[body]] += moments[body]
+    axes, place = data.ximat.reshape(-1, 3, 3), np.insert(data.xipos - origin, 3, 1.0, axis=1)
+    moments = model.body_mass[:, None, None] * place[:, :, None] * place[:, None]
+    spread = 0.5 * model.body_inertia.sum(1, keepdims=True) - model.body_inertia  # sum m x^2, y^2, z^2 about the principal axes
+    moments[:, :3, :3] += axes * spread[:, None] @ axes.transpose(0, 2, 1)
     return moments
 
 
@@ -322,9 +317,5 @@ def _same(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
 
 def _other_side(name: str) -> str:
     """Return the name of what takes the place of `name` in the mirror image: `right_knee` is `left_knee`, `waist` itself."""
-    for side, other in (("right", "left"), ("left", "right")):
-        if name.startswith(f"{side}_"):
-            return other + name.removeprefix(side)
-        if name.endswith(f"_{side}"):
-            return name.removesuffix(side) + other
-    return name
+    sides = {"right": "left", "left": "right"}
+    return re.sub("^(right|left)(?=_)|(?<=_)(right|left)$", lambda side: sides[side[0]], name, count=1)

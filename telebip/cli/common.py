@@ -38,6 +38,20 @@ class Parser(argparse.ArgumentParser):
             allow_abbrev=False,
         )
 
+    def add_engine(self) -> None:
+        """Add `--device` and `--backend`."""
+        self.add_device()
+        names = ("auto", "native", "warp")
+        self.add_argument("--backend", default="auto", choices=names, help="physics engine (default: auto)")
+
+    def add_device(self) -> None:
+        """Add `--device`."""
+        self.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto, which prefers CUDA)")
+
+    def add_overrides(self, text: str = "override any field of the task") -> None:
+        """Add the overrides, with `text` as their help."""
+        self.add_argument("overrides", nargs="*", metavar="key.path=value", help=text)
+
     def parse(self, argv: Sequence[str] | None) -> argparse.Namespace:
         """Parse options and positional arguments in any order."""
         options, unknown = self.parse_known_intermixed_args(argv)
@@ -61,10 +75,8 @@ def invocation(command: str) -> str:
 
 def _is_own_script(program: Path) -> bool:
     """Whether the program is a script of the user's that calls `telebip.cli.main.main`, with terms of their own."""
-    is_ours = program.stem == "__main__" or any(
-        (ROOT / folder / program.name).is_file() for folder in ("scripts", "telebip/cli")
-    )
-    return program.suffix == ".py" and not is_ours
+    ours = [ROOT / folder / program.name for folder in ("scripts", "telebip/cli")]
+    return program.suffix == ".py" and program.stem != "__main__" and not any(file.is_file() for file in ours)
 
 
 def run(command: Callable[[], None]) -> NoReturn:
@@ -89,7 +101,7 @@ def run(command: Callable[[], None]) -> NoReturn:
 
 
 def silence_stdout() -> None:
-    """Send nowhere what is yet to be printed, by Python itself when it ends too."""
+    """Send nowhere what is yet to be printed, by Python too when it ends."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
@@ -104,22 +116,15 @@ def open_checkpoint(path: str | Path) -> "Checkpoint":
 
 
 def open_policy(path: str | Path) -> "Checkpoint":
-    """Do what `open_checkpoint` does for a policy that is to walk, and say which terms of its task are left out.
-
-    Those are terms of the user's own that this process does not know; walking needs no rewards, which are passed over.
-    """
+    """Do what `open_checkpoint` does for a policy that is to walk, and say which terms of its task are unknown here."""
     checkpoint = open_checkpoint(path)
-    if unknown := [name for name in checkpoint.missing if not name.startswith("rewards.")]:
+    if unknown := [name for name in checkpoint.missing if not name.startswith("rewards.")]:  # walking needs no rewards
         print(f"note: '{checkpoint.path}' is walked without {', '.join(unknown)}, unknown here", file=sys.stderr)
     return checkpoint
 
 
 def policy_of(checkpoint: "Checkpoint", env: "TelebipEnv") -> "Policy":
-    """Return a checkpoint's policy, to walk in `env`.
-
-    Raises:
-        UserError: the robot or the observations are others than those it was trained on.
-    """
+    """Return a checkpoint's policy, to walk in `env`; a `UserError` if it was trained on other joints or observations."""
     from telebip.rl.policy import load_policy, require_fit
 
     require_fit(checkpoint, env)
@@ -127,21 +132,13 @@ def policy_of(checkpoint: "Checkpoint", env: "TelebipEnv") -> "Policy":
 
 
 def check_connect(options: argparse.Namespace) -> None:
-    """Refuse a `--connect` without a `--viewer rerun`.
-
-    Raises:
-        UserError: it is one.
-    """
+    """Refuse a `--connect` without a `--viewer rerun`."""
     if options.connect and options.viewer != "rerun":
         raise UserError("--connect names a rerun viewer; it goes with --viewer rerun")
 
 
 def check_outputs(json: str | None, plot: str | None) -> None:
-    """Refuse files that cannot be written, now and not after minutes of measuring.
-
-    Raises:
-        UserError: a file cannot be written, or `plot` has an unknown ending.
-    """
+    """Refuse files that cannot be written, and plots of unknown endings, now and not after minutes of measuring."""
     if plot and Path(plot).suffix not in (".png", ".svg", ".pdf"):
         raise UserError(f"--plot writes FILE.png, FILE.svg or FILE.pdf, got '{plot}'")
     for file in map(Path, filter(None, (json, plot))):
@@ -165,11 +162,8 @@ def resolve_device(name: str) -> "torch.device":
     import torch
 
     available = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
-    if name == "auto":
-        name = available[-1] if len(available) == 1 else available[1]
-    elif name == "cuda":
-        name = "cuda:0"
-    elif name != "cpu" and not (name.startswith("cuda:") and name[5:].isdigit()):
+    name = {"auto": available[:2][-1], "cuda": "cuda:0"}.get(name, name)
+    if not re.fullmatch(r"cpu|cuda:\d+", name):
         raise UserError(f"unknown device '{name}'; valid: auto, cpu, cuda, cuda:N")
     if name not in available:
         raise UserError(f"device '{name}' is not there; this machine has: {', '.join(available)}")

@@ -33,38 +33,43 @@ def main(argv: Sequence[str] | None = None) -> None:
     console = Console()
     with console.status("loading torch and the physics engine"):
         from telebip.eval.push import PushProtocol
-        from telebip.eval.report import make_folder, write_report, write_results
-        from telebip.eval.suites import Protocol, check_suites, evaluate
-        from telebip.robot import load_robot
+        from telebip.eval.report import write_report
+        from telebip.eval.suites import Protocol, check_suites
     suites = check_suites(options.suite.split(","))
     check_overrides(options.overrides, suites)
-    device = resolve_device(options.device)
-    if options.controller:
-        candidate = controller_candidate(options.controller, options.label, options.overrides)
-    else:
-        candidate = checkpoint_candidate(options.checkpoint, options.label, options.overrides)
-    push = PushProtocol(max_force=options.max_force, worlds=options.push_worlds)
-    candidate = replace(candidate, source=" ".join([candidate.source, *options.given]))
     protocol = Protocol(
         worlds=options.num_envs,
         duration=options.duration,
         skip=min(5.0, 0.25 * options.duration),
         commands=options.commands,
-        push=push,
-        device=device,
+        push=PushProtocol(max_force=options.max_force, worlds=options.push_worlds),
+        device=resolve_device(options.device),
         backend=options.backend,
     )
-    robot = load_robot(candidate.task.sim.robot)
+    candidate_of = controller_candidate if options.controller else checkpoint_candidate
+    candidate = candidate_of(options.controller or options.checkpoint, options.label, options.overrides)
+    candidate = replace(candidate, source=" ".join([candidate.source, *options.given]))
     out = Path(options.out) if options.out else default_folder(candidate.label)
-    make_folder(out)
-    with progress_bar(console) as show:
-        results = evaluate(candidate, robot, suites, protocol, show)
-    write_results(results, out)
+    results = measure(console, candidate, suites, protocol, out)
     title, text = f"{candidate.label}: how it walks", f"Measured by: {candidate.source}"
     write_report([results], out, title, text, references=references())
     lines = (out / "report.md").read_text(encoding="utf-8").splitlines()
     console.print("\n".join(line for line in lines if not line.startswith("![")))
     console.print(f"wrote {out}/results.json, report.md with its pictures, and report.html")
+
+
+def measure(console, candidate, suites: Sequence[str], protocol, out: Path) -> dict:
+    """Measure a candidate with a progress bar, write `out`/results.json, and return what stands in it."""
+    from telebip.eval.report import make_folder, write_results
+    from telebip.eval.suites import evaluate
+    from telebip.robot import load_robot
+
+    robot = load_robot(candidate.task.sim.robot)
+    make_folder(out)
+    with progress_bar(console) as show:
+        results = evaluate(candidate, robot, suites, protocol, show)
+    write_results(results, out)
+    return results
 
 
 def default_folder(label: str) -> Path:
@@ -74,11 +79,7 @@ def default_folder(label: str) -> Path:
 
 
 def check_overrides(overrides: Sequence[str], suites: Sequence[str]) -> None:
-    """Refuse overrides of what the evaluator itself sets.
-
-    Raises:
-        UserError: there is one.
-    """
+    """Refuse overrides of what the evaluator itself sets."""
     for override in overrides:
         key = override.partition("=")[0]
         if key in SET_HERE:
@@ -169,12 +170,8 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     who = parser.add_mutually_exclusive_group()
     who.add_argument("--checkpoint", metavar="PATH_OR_RUN", help="a checkpoint file, or a run folder for its newest")
     who.add_argument("--controller", choices=CONTROLLERS, help="a model-based walker: angular momentum, or DCM")
-    parser.add_argument(
-        "--suite",
-        default="tracking,push,gait,learning",
-        metavar="A,B",
-        help="which suites (default: tracking,push,gait,learning)",
-    )
+    suites = "tracking,push,gait,learning"
+    parser.add_argument("--suite", default=suites, metavar="A,B", help=f"which suites (default: {suites})")
     parser.add_argument("--out", metavar="DIR", help="folder of results.json and the report (default: reports/<label>)")
     parser.add_argument("--label", metavar="NAME", help="name in tables and plots (default: the task's)")
     parser.add_argument("--num-envs", type=int, default=64, metavar="N", help="worlds for each commanded speed (default: 64)")
@@ -188,20 +185,15 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--max-force", type=float, default=300.0, metavar="N", help="largest push tried in N (default: 300)")
     parser.add_argument("--push-worlds", type=int, default=32, metavar="N", help="worlds for each push (default: 32)")
-    parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto, which prefers CUDA)")
-    parser.add_argument("--backend", default="auto", choices=("auto", "native", "warp"), help="physics engine (default: auto)")
-    parser.add_argument("overrides", nargs="*", metavar="key.path=value", help="override any field of the task")
+    parser.add_engine()
+    parser.add_overrides()
     options = parser.parse(argv)
     if not (options.checkpoint or options.controller):
         raise UserError(
             "what is to be measured? --checkpoint PATH_OR_RUN (try assets/policies/telebip_efficient), or --controller"
         )
-    for name, low, high in (
-        ("num_envs", 1, 2**20),
-        ("duration", 1.0, 3600.0),
-        ("max_force", 5.0, 5000.0),
-        ("push_worlds", 1, 2**16),
-    ):
+    bounds = {"num_envs": (1, 2**20), "duration": (1, 3600), "max_force": (5, 5000), "push_worlds": (1, 2**16)}
+    for name, (low, high) in bounds.items():
         value = getattr(options, name)
         if not low <= value <= high:
             raise UserError(f"--{name.replace('_', '-')} must be between {low:g} and {high:g}, got {value:g}")

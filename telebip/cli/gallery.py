@@ -33,6 +33,6 @@ def main(argv: Sequence[str] | None = None) -> None:
     make_folder(options.out)
     gallery = Gallery(open_checkpoint(options.checkpoint), tuple(options.command))
     for name in options.only or PICTURES:
-        note = PICTURES[name](gallery, options.out / name)
         file = options.out / name
+        note = PICTURES[name](gallery, file)
         print(f"{file}: {note}" if note else f"{file}: {file.stat().st_size / 1e3:.0f} kB", flush=True)

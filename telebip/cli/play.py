@@ -3,10 +3,11 @@
 import argparse
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from telebip.cli.common import CONTROLLERS, Parser, check_connect, open_policy, policy_of, resolve_device
-from telebip.cli.evaluate import speed
+from telebip.cli.evaluate import progress_bar, speed
 from telebip.config import TaskConfig, load_task
 from telebip.control.config import split_overrides
 from telebip.errors import UserError
@@ -33,21 +34,19 @@ def main(argv: Sequence[str] | None = None) -> None:
     options = _parse(argv)
     choose_opengl()
     if options.replay:
-        return _replay(options)
-    checkpoint = None
-    if options.checkpoint:
-        checkpoint = open_policy(options.checkpoint)
-        task, config = checkpoint.task, checkpoint.config
+        _replay(options)
     else:
-        task, config = Path(options.task).stem, load_task(options.task)
+        _play(options)
+
+
+def _play(options: argparse.Namespace) -> None:
+    """Walk everyone asked for, one after the other, say how it went, and show it as asked."""
+    checkpoint = open_policy(options.checkpoint) if options.checkpoint else None
+    task = checkpoint.task if checkpoint else Path(options.task).stem
     overrides = [*([] if options.seed is None else [f"seed={options.seed}"]), *options.overrides]
+    config = checkpoint.config if checkpoint else load_task(options.task)
     config = as_evaluated(config, options.num_envs, options.duration, overrides, disturbed=options.disturb)
-    command = _command(options.command, config)
-    _play(options, task, config, command, checkpoint)
-
-
-def _play(options: argparse.Namespace, task: str, config: TaskConfig, command, checkpoint) -> None:
-    from rich.progress import Progress
+    command = options.command or [0.5 * (low + high) for low, high in _ranges(config)]
 
     from telebip.cli.console import Console
 
@@ -65,25 +64,24 @@ def _play(options: argparse.Namespace, task: str, config: TaskConfig, command, c
         require_viewer(options.connect)
     device = resolve_device(options.device)
     robot = load_robot(config.sim.robot)
-
-    _warn_untrained(console, command, checkpoint)
+    if checkpoint:
+        _warn_untrained(console, command, checkpoint.config)
     rollouts = []
     for name in ["RL" if checkpoint else options.controller or options.agent, *options.beside]:
         env = TelebipEnv(with_estimate(config) if name in CONTROLLERS else config, robot, device, options.backend)
         env.set_command(*command)
-        overrides = options.control_overrides if name == options.controller else []
-        policy = _policy(checkpoint if name == "RL" else name, env, overrides)
+        own = options.control_overrides if name == options.controller else []
+        policy = policy_of(checkpoint, env) if checkpoint and name == "RL" else _policy(name, env, own)
         if options.viewer == "mujoco":
             from telebip.viz.viewer import steer
 
             return steer(env, policy)
         steps = max(1, round(options.duration / env.step_dt))
-        with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-            walking = bar.add_task(f"{name} walks", total=steps)
-            rollout = roll_out(env, policy, steps, progress=lambda step, b=bar, w=walking: b.update(w, completed=step))
+        with progress_bar(console) as show:
+            rollout = roll_out(env, policy, steps, partial(show, f"{name} walks", total=steps))
         rollouts.append((name.upper() if name in CONTROLLERS else name, rollout))
         summary = summarise(rollout, skip=min(5.0, 0.25 * options.duration))
-        who = checkpoint.path if name == "RL" else f"{'agent' if name in AGENTS else 'controller'} '{name}'"
+        who = checkpoint.path if checkpoint and name == "RL" else f"{'agent' if name in AGENTS else 'controller'} '{name}'"
         console.print(f"{who}: {task}, {summary.worlds} world{'s' if summary.worlds > 1 else ''} x {summary.duration:g} s")
         console.print(_lines(summary))
     _show(console, options, rollouts, robot)
@@ -94,8 +92,7 @@ def _replay(options: argparse.Namespace) -> None:
     from telebip.cli.console import Console
     from telebip.replay import describe, load_fault, replay
 
-    console = Console()
-    fault = load_fault(options.replay)
+    console, fault = Console(), load_fault(options.replay)
     fault = replace(fault, config=load_task(fault.config, options.overrides))
     backend = fault.backend if options.backend == "auto" else options.backend
     done = replay(fault, backend)
@@ -113,8 +110,6 @@ def _replay(options: argparse.Namespace) -> None:
 
 def _show(console, options: argparse.Namespace, rollouts, robot) -> None:
     """Record, film, draw, and open the rerun viewer, as asked."""
-    from rich.progress import Progress
-
     from telebip.viz.scene import line_up
 
     actors = line_up(rollouts, worlds=options.show)
@@ -132,9 +127,8 @@ def _show(console, options: argparse.Namespace, rollouts, robot) -> None:
     elif file:
         from telebip.viz.video import film
 
-        with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-            filming = bar.add_task("filming")
-            film(actors, robot, file, progress=lambda frame, total: bar.update(filming, completed=frame, total=total))
+        with progress_bar(console) as show_progress:
+            film(actors, robot, file, progress=partial(show_progress, "filming"))
         console.print(f"filmed {file}")
     if options.viewer == "rerun":
         from telebip.viz.rerun import show
@@ -143,11 +137,8 @@ def _show(console, options: argparse.Namespace, rollouts, robot) -> None:
         console.print("shown in the rerun viewer")
 
 
-def _policy(who, env, overrides: Sequence[str]):
-    """Return the policy of a checkpoint or of a controller, or a stand-in.
-
-    `zero` holds the nominal pose, `random` draws standard normal actions.
-    """
+def _policy(who: str, env, overrides: Sequence[str]):
+    """Return a controller or an agent: `zero` holds the nominal pose, `random` draws standard normal actions."""
     import torch
 
     from telebip.control.factory import make_controller
@@ -155,13 +146,10 @@ def _policy(who, env, overrides: Sequence[str]):
 
     if who in CONTROLLERS:
         return make_controller(who, env, overrides)
-
     shape = (env.num_envs, env.num_actions)
     if who == "zero":
         return Stateless(lambda obs: torch.zeros(shape, device=env.device))
-    if who == "random":
-        return Stateless(lambda obs: torch.randn(shape, generator=env.generator, device=env.device))
-    return policy_of(who, env)
+    return Stateless(lambda obs: torch.randn(shape, generator=env.generator, device=env.device))
 
 
 def _lines(s) -> str:
@@ -180,32 +168,21 @@ def _lines(s) -> str:
     return "\n".join(f"  {name:18}{value}" for name, value in rows)
 
 
-def _command(given: Sequence[float] | None, config: TaskConfig) -> tuple[float, float, float]:
-    if given:
-        return (given[0], given[1], given[2])
-    ranges = (config.commands.lin_vel_x, config.commands.lin_vel_y, config.commands.ang_vel_z)
-    return tuple(0.5 * (low + high) for low, high in ranges)  # type: ignore[return-value]
+def _ranges(config: TaskConfig) -> tuple[tuple[float, float], ...]:
+    return config.commands.lin_vel_x, config.commands.lin_vel_y, config.commands.ang_vel_z
 
 
-def _warn_untrained(console, command: tuple[float, float, float], checkpoint) -> None:
+def _warn_untrained(console, command: Sequence[float], trained: TaskConfig) -> None:
     """Say so if the policy never saw such a command in training."""
-    if checkpoint is None:
-        return
-    trained = checkpoint.config.commands
     names = ("forward speed", "leftward speed", "yaw rate")
-    ranges = (trained.lin_vel_x, trained.lin_vel_y, trained.ang_vel_z)
-    slack = (0.0, 0.0, trained.heading_limit if trained.heading_gain > 0 else 0.0)
-    for name, value, (low, high), extra in zip(names, command, ranges, slack, strict=True):
+    slack = (0.0, 0.0, trained.commands.heading_limit if trained.commands.heading_gain > 0 else 0.0)
+    for name, value, (low, high), extra in zip(names, command, _ranges(trained), slack, strict=True):
         if not low - extra <= value <= high + extra:
             console.print(f"note: {name} {value:g} lies outside what this policy was trained on, [{low:g}, {high:g}]")
 
 
 def _check_replay(parser: Parser, options: argparse.Namespace) -> None:
-    """Refuse what cannot change the step of a dumped fault.
-
-    Raises:
-        UserError: there is something.
-    """
+    """Refuse what cannot change the step of a dumped fault."""
     if options.viewer == "mujoco":
         raise UserError("a --replay is five poses; look at them with --viewer rerun or --record")
     for name in ("beside", "command", "disturb", "duration", "num_envs", "seed", "task"):
@@ -223,24 +200,12 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     who.add_argument("--controller", choices=CONTROLLERS, help="a model-based walker, see configs/control/")
     who.add_argument("--replay", metavar="FAULT", help="repeat the step that a training dumped as runs/.../faults/<kind>.pt")
     who.add_argument("--agent", choices=AGENTS, help="no policy: nominal joint targets, or Gaussian actions")
-    parser.add_argument(
-        "--task", metavar="NAME", default="telebip_flat", help="of an --agent or --controller (default: telebip_flat)"
-    )
-    parser.add_argument(
-        "--beside",
-        choices=CONTROLLERS + AGENTS,
-        nargs="+",
-        default=[],
-        metavar="WHO",
-        help="who else walks, on lanes of their own",
-    )
-    parser.add_argument(
-        "--command",
-        nargs=3,
-        type=speed,
-        metavar=("VX", "VY", "WZ"),
-        help="m/s forward, m/s left, rad/s (default: the middle of the task's ranges)",
-    )
+    of_whom = "of an --agent or --controller (default: telebip_flat)"
+    parser.add_argument("--task", metavar="NAME", default="telebip_flat", help=of_whom)
+    everyone, others = CONTROLLERS + AGENTS, "who else walks, on lanes of their own"
+    parser.add_argument("--beside", choices=everyone, nargs="+", default=[], metavar="WHO", help=others)
+    middle = "m/s forward, m/s left, rad/s (default: the middle of the task's ranges)"
+    parser.add_argument("--command", nargs=3, type=speed, metavar=("VX", "VY", "WZ"), help=middle)
     parser.add_argument("--duration", type=float, default=20.0, metavar="S", help="seconds to walk (default: 20)")
     parser.add_argument("--num-envs", type=int, default=1, metavar="N", help="worlds; they differ in their start (default: 1)")
     parser.add_argument("--disturb", action="store_true", help="keep the task's pushes, friction and observation noise on")
@@ -249,14 +214,8 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--record", metavar="FILE", help="write FILE.rrd for the rerun viewer, FILE.mp4, FILE.gif, or FILE.png")
     parser.add_argument("--show", type=int, default=4, metavar="N", help="at most so many worlds, side by side (default: 4)")
     parser.add_argument("--seed", metavar="S", help="of the initial states (default: the task's)")
-    parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto, which prefers CUDA)")
-    parser.add_argument("--backend", default="auto", choices=("auto", "native", "warp"), help="physics engine (default: auto)")
-    parser.add_argument(
-        "overrides",
-        nargs="*",
-        metavar="key.path=value",
-        help="override any field of the task, or control.key of a --controller; of a --replay, sim.robot alone",
-    )
+    parser.add_engine()
+    parser.add_overrides("override any field of the task, or control.key of a --controller; of a --replay, sim.robot alone")
     options = parser.parse(argv)
     if not (options.checkpoint or options.controller or options.agent or options.replay):
         raise UserError(

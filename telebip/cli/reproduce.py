@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from telebip.cli.common import Parser, open_checkpoint, resolve_device
-from telebip.cli.evaluate import checkpoint_candidate, controller_candidate, progress_bar, references
+from telebip.cli.evaluate import checkpoint_candidate, controller_candidate, measure, references
 from telebip.config import load_task
 from telebip.errors import UserError, nearest
 
@@ -42,20 +42,19 @@ def main(argv: Sequence[str] | None = None) -> None:
             raise UserError(f"unknown walker '{name}'; {nearest(name, names)}")
     out = Path(options.out)
     make_folder(out)
-    for training in TRAININGS:
-        if not options.only or training.name in options.only:
-            for seed in range(1, options.seeds + 1):
-                run_dir = SHIPPED / training.name if options.shipped else _train(console, training, seed, options)
-                if run_dir is None:
-                    return
-                name, label = training.name, training.label
-                if seed > 1:
-                    name, label = f"{name}-seed{seed}", f"{label}, seed {seed}"
-                _measure(console, out / name, training, options, checkpoint_candidate(str(run_dir), label))
-    for baseline in BASELINES:
-        if not options.only or baseline.name in options.only:
-            candidate = controller_candidate(baseline.controller, baseline.label, baseline.overrides)
-            _measure(console, out / baseline.name, baseline, options, candidate)
+    only = options.only or names
+    for training in (training for training in TRAININGS if training.name in only):
+        for seed in range(1, options.seeds + 1):
+            run_dir = SHIPPED / training.name if options.shipped else _train(console, training, seed, options)
+            if run_dir is None:
+                return
+            name, label = training.name, training.label
+            if seed > 1:
+                name, label = f"{name}-seed{seed}", f"{label}, seed {seed}"
+            _measure(console, out / name, training, options, checkpoint_candidate(str(run_dir), label))
+    for baseline in (baseline for baseline in BASELINES if baseline.name in only):
+        candidate = controller_candidate(baseline.controller, baseline.label, baseline.overrides)
+        _measure(console, out / baseline.name, baseline, options, candidate)
     results = {name: [_read(file) for file in _measured(out, name, seeds=not options.shipped)] for name in names}
     seeds = [f"{t.label} ({n} seed{'s' if n > 1 else ''})" for t in TRAININGS if (n := len(results[t.name]))]
     text = INTRODUCTION.format(trainings=", ".join(seeds) or "none")
@@ -70,11 +69,7 @@ def _measured(out: Path, name: str, seeds: bool) -> list[Path]:
 
 
 def _read(file: Path):
-    """Return results that the report can show.
-
-    Raises:
-        UserError: they are not.
-    """
+    """Return results, or raise a `UserError` unless the report can show them."""
     from telebip.eval.report import can_be_shown, read_results
 
     results = read_results(file)
@@ -105,19 +100,19 @@ def _train(console, training, seed: int, options: argparse.Namespace) -> Path | 
 
 def _measure(console, out: Path, walker, options: argparse.Namespace, candidate) -> None:
     """Measure one walker, unless complete results of the same policy or parameters, measured in the same way, are there."""
-    from telebip.eval.report import make_folder, write_results
-    from telebip.eval.suites import Protocol, evaluate
-    from telebip.robot import load_robot
+    from telebip.eval.push import PushProtocol
+    from telebip.eval.suites import Protocol
 
-    protocol = _quick_protocol() if options.quick else Protocol(device=resolve_device(options.device))
+    if options.quick:
+        push = PushProtocol(max_force=10.0, worlds=2, warmup=0.5, horizons=(1.0, 2.0))
+        protocol = Protocol(worlds=4, duration=3.0, skip=1.0, push=push)
+    else:
+        protocol = Protocol(device=resolve_device(options.device))
     file = out / "results.json"
     if not options.again and _is_current(file, candidate, walker.suites, protocol):
         console.print(f"{walker.name}: measured already")
         return
-    make_folder(out)
-    with progress_bar(console) as show:
-        results = evaluate(candidate, load_robot(candidate.task.sim.robot), walker.suites, protocol, show)
-    write_results(results, out)
+    measure(console, candidate, walker.suites, protocol, out)
     console.print(f"{walker.name}: measured, see {file}")
 
 
@@ -131,33 +126,22 @@ def _is_current(file: Path, candidate, suites: Sequence[str], protocol) -> bool:
         return False
 
 
-def _quick_protocol():
-    from telebip.eval.push import PushProtocol
-    from telebip.eval.suites import Protocol
-
-    push = PushProtocol(max_force=10.0, worlds=2, warmup=0.5, horizons=(1.0, 2.0))
-    return Protocol(worlds=4, duration=3.0, skip=1.0, push=push)
-
-
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = Parser("Train and measure every policy of the study and both model-based walkers, and report.", EXAMPLES)
-    parser.add_argument(
-        "--out", metavar="DIR", help="where results and report go (default: docs/results; quick: runs/study_quick/results)"
-    )
+    folders = "(default: docs/results; quick: runs/study_quick/results)"
+    parser.add_argument("--out", metavar="DIR", help=f"where results and report go {folders}")
     parser.add_argument("--runs", metavar="DIR", help="where trainings go (default: runs/study; quick: runs/study_quick)")
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="these walkers alone")
     parser.add_argument("--shipped", action="store_true", help="measure the policies in assets/policies instead of training")
     parser.add_argument("--seeds", type=int, default=1, metavar="N", help="trainings of each policy: seeds 1 to N (default: 1)")
     parser.add_argument("--again", action="store_true", help="measure again what has been measured")
     parser.add_argument("--quick", action="store_true", help="toy size: two iterations, four worlds")
-    parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto, which prefers CUDA)")
+    parser.add_device()
     options = parser.parse(argv)
     options.out = options.out or ("runs/study_quick/results" if options.quick else "docs/results")
     options.runs = options.runs or ("runs/study_quick" if options.quick else "runs/study")
-    if options.seeds < 1 or (options.shipped and options.seeds > 1):
-        raise UserError(
-            "--shipped measures the one policy that there is of each; leave out --seeds"
-            if options.shipped
-            else f"--seeds must be 1 or more, got {options.seeds}"
-        )
+    if options.shipped and options.seeds != 1:
+        raise UserError("--shipped measures the one policy that there is of each; leave out --seeds")
+    if options.seeds < 1:
+        raise UserError(f"--seeds must be 1 or more, got {options.seeds}")
     return options

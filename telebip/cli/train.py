@@ -191,7 +191,7 @@ def _announce(trainer: "Trainer", console: "Console", restart: str) -> None:
     env, size = trainer.env, trainer.ranks.size
     worlds = f"{env.num_envs} worlds" if size == 1 else f"{size} processes x {env.num_envs} worlds"
     console.print(
-        f"{trainer.task}: {worlds} on {env.device} ({env.sim.backend}), update in {trainer.arithmetic}, "
+        f"{trainer.task}: {worlds} on {env.device} ({env.sim.backend}), networks in {trainer.arithmetic}, "
         f"writing to {trainer.run_dir}"
     )
     if trainer.iteration:

@@ -70,13 +70,8 @@ def merge(base: Tree, layer: Tree, is_whole: Callable[[str], bool], prefix: str 
     merged = dict(base)
     for name, entry in layer.items():
         below, key = base.get(name), f"{prefix}{name}"
-        if (
-            below
-            and below.is_section
-            and entry.is_section
-            and not is_whole(key)
-            and not _is_of_another_term(entry, below, name)
-        ):
+        are_sections = below and below.is_section and entry.is_section
+        if are_sections and not is_whole(key) and not _is_of_another_term(entry, below, name):
             entry = Entry(merge(below.value, entry.value, is_whole, f"{key}."), entry.where)
         elif entry.value is None:
             entry = Entry(None, entry.where, removes=below is not None)
@@ -86,9 +81,8 @@ def merge(base: Tree, layer: Tree, is_whole: Callable[[str], bool], prefix: str 
 
 def _is_of_another_term(entry: Entry, below: Entry, name: str) -> bool:
     """Whether an entry says `term: function` and the one below it is not that function's, by its `term` or its name."""
-    if "term" not in entry.value:
-        return False
-    return entry.value["term"].value != (below.value["term"].value if "term" in below.value else name)
+    function = below.value["term"].value if "term" in below.value else name
+    return "term" in entry.value and entry.value["term"].value != function
 
 
 def plain(value: Any) -> Any:

@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import math
 import numbers
+import operator
 import re
 import types
 import typing
@@ -16,6 +17,7 @@ from telebip.errors import UserError, nearest
 from telebip.mdp.term import TERMS, Kind, ObservationGroup, Parameter, Params, Quantity, Term
 
 KINDS: dict[str, Kind] = {"rewards": "reward", "terminations": "termination", "events": "event"}
+BOUNDS = {"gt": (">", operator.gt), "ge": (">=", operator.ge), "lt": ("<", operator.lt), "le": ("<=", operator.le)}
 GROUP_FIELDS = {f.name: Parameter.of(f.type, f.default) for f in dataclasses.fields(ObservationGroup) if f.name != "terms"}
 
 
@@ -79,11 +81,10 @@ class Validator:
         """Return the groups of observations."""
         tree, groups = _tree_of(entry, key, "name its groups"), {}
         for name, place, child in _kept(tree, key):
-            parts = _tree_of(child, place, "name its terms")
-            terms = {n: part for n, part in parts.items() if n not in GROUP_FIELDS}
+            terms = dict(_tree_of(child, place, "name its terms"))
+            own = Entry({n: terms.pop(n) for n in GROUP_FIELDS if n in terms}, child.where)
             if all(part.removes for part in terms.values()):
                 raise UserError(f"{child.where}: {place} has no terms; {nearest('', _known('observation'))}")
-            own = Entry({n: part for n, part in parts.items() if n in GROUP_FIELDS}, child.where)
             known = self.terms("observation", terms, place, is_needed=name == "policy")
             group = ObservationGroup(known, **self.fields(GROUP_FIELDS, own, place))
             groups |= {name: group} if known else {}
@@ -144,11 +145,7 @@ def _kept(tree: Tree, key: str, known: Container[str] = ()) -> Iterator[tuple[st
 
 
 def _convert(kind: Any, value: Any) -> Any:
-    """Return a value as an annotation's type.
-
-    Raises:
-        OverflowError, ValueError: it is none of that type.
-    """
+    """Return a value as an annotation's type; an `OverflowError` or a `ValueError` if it is none."""
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if kind in (int, float):
         return _number(kind, value)
@@ -184,7 +181,7 @@ def _check_bounds(value: Any, quantity: Quantity, named: str) -> None:
     for entry in value if isinstance(value, tuple | list) else [value]:
         if isinstance(entry, float) and not math.isfinite(entry):
             raise UserError(f"{named} must be finite, got {entry}")
-        for bound, (sign, holds) in _BOUNDS.items():
+        for bound, (sign, holds) in BOUNDS.items():
             limit = getattr(quantity, bound)
             if limit is not None and not holds(entry, limit):
                 raise UserError(f"{named} must be {sign} {limit}{' ' + quantity.unit if quantity.unit else ''}, got {entry}")
@@ -194,25 +191,16 @@ def _check_bounds(value: Any, quantity: Quantity, named: str) -> None:
         raise UserError(f"{named} must not be empty")
 
 
-_BOUNDS = {
-    "gt": (">", lambda value, limit: value > limit),
-    "ge": (">=", lambda value, limit: value >= limit),
-    "lt": ("<", lambda value, limit: value < limit),
-    "le": ("<=", lambda value, limit: value <= limit),
-}
-
-_NAMES = {
-    float: ("a number", "numbers"),
-    int: ("a whole number", "whole numbers"),
-    str: ("a text", "texts"),
-    bool: ("true or false", "true or false"),
-}
+def _describe(value: Any) -> str:
+    text = repr(value) if isinstance(value, str) else str(value)
+    return text if len(text) <= 40 else text[:37] + "..."
 
 
 def _type_name(kind: Any, several: bool = False) -> str:
     """Return what a type is called in errors: one of it, or several."""
-    if kind in _NAMES:
-        return _NAMES[kind][several]
+    one = {float: "a number", int: "a whole number", str: "a text", bool: "true or false"}
+    if kind in one:
+        return f"{one[kind].removeprefix('a ')}s" if several and kind is not bool else one[kind]
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin is Literal:
         return "one of " + ", ".join(map(str, arguments))
@@ -222,8 +210,3 @@ def _type_name(kind: Any, several: bool = False) -> str:
     if origin is tuple and len(arguments) == 2:
         return f"{'pairs' if several else 'a pair'} [low, high] of {entries}"
     return f"a list of {len(arguments)} {entries}" if origin is tuple else f"a list of {entries}"
-
-
-def _describe(value: Any) -> str:
-    text = repr(value) if isinstance(value, str) else str(value)
-    return text if len(text) <= 40 else text[:37] + "..."

@@ -6,7 +6,6 @@ from dataclasses import replace
 from telebip.config import TaskConfig
 from telebip.control import alip, dcm
 from telebip.control.config import load_controller
-from telebip.control.kinematics import Kinematics
 from telebip.control.walker import ESTIMATE, Walker
 from telebip.env import TelebipEnv
 from telebip.errors import UserError, nearest
@@ -39,12 +38,4 @@ def make_controller(name: str, env: TelebipEnv, overrides: Sequence[str] = ()) -
     """
     if name not in PLACEMENTS:
         raise UserError(f"unknown controller '{name}'; {nearest(name, PLACEMENTS)}")
-    return Walker(
-        load_controller(name, overrides),
-        PLACEMENTS[name],
-        Kinematics(env.robot, env.device),
-        nominal=env.world.nominal,
-        action_scale=env.world.action_scale,
-        num_envs=env.num_envs,
-        step_dt=env.step_dt,
-    )
+    return Walker(load_controller(name, overrides), PLACEMENTS[name], env)

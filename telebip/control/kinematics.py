@@ -11,6 +11,7 @@ Inside the walkers worlds come last and components first, as in (3, num_envs): a
 is, and each component is contiguous. Of several legs the shape is (3, 2, num_envs), right and left.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from telebip.errors import UserError
-from telebip.robot import FEET, Robot
+from telebip.robot import FEET, Robot, moments_of_mass
 
 JOINTS = tuple(f"{side}_{joint}" for side in ("right", "left") for joint in ("hip_roll", "hip_pitch", "knee"))
 """The joints of a robot that the walkers can use, in the order of its actuators."""
@@ -64,8 +65,12 @@ class Kinematics:
         sites = [int(model.sensor(f"{foot}_force").objid[0]) for foot in FEET]
         hip = data.xanchor[[model.joint(JOINTS[0]).id, model.joint(JOINTS[3]).id]]
         links = np.array([_link(model, body) for body in range(model.nbody)])
-        roll, thigh, shank, *left = [Inertial.of(model, data, np.flatnonzero(links == link)) for link in range(1, 7)]
-        _check_legs(robot, data, hip, data.site_xpos[sites], [roll, thigh, shank], left)
+
+        def moments(of_links: Sequence[int], origin: NDArray) -> NDArray:
+            return moments_of_mass(model, data, origin)[np.isin(links, of_links)].sum(0)
+
+        roll, thigh, shank = right = [moments([link], hip[0]) for link in (1, 2, 3)]
+        _check_legs(robot, data, hip, data.site_xpos[sites], right, [moments([link], hip[1]) for link in (4, 5, 6)])
 
         self.gravity = float(-model.opt.gravity[2])  # [m/s^2]
         self.friction = float(model.geom_friction[robot.floor_id, 0])  # sliding, of the ground [-]
@@ -78,17 +83,17 @@ class Kinematics:
         self.joint_range = constant(robot.joint_range[:, :, None])  # (6, 2, 1) [rad | m]
 
         # The trunk with the hip links, then one leg: masses, first and second moments along the leg, at knee 0.
-        upper = Inertial.of(model, data, np.flatnonzero(np.isin(links, (0, 1, 4))))
-        self.mass = upper.mass + 2.0 * (thigh.mass + shank.mass)  # [kg]
-        self._leg_mass, self._shank_mass = thigh.mass + shank.mass, shank.mass
-        self._thigh_moment = thigh.mass * float(thigh.com[2] - hip[0, 2])
-        self._shank_height = float(shank.com[2] - hip[0, 2])
-        across = thigh.inertia[0, 0] + shank.inertia[0, 0] + self._thigh_moment**2 / thigh.mass
-        self._across, self._along = float(across), float(thigh.inertia[2, 2] + shank.inertia[2, 2])
-        self._roll_inertia = float(roll.inertia[0, 0])
-        self._upper_moment = constant(upper.mass * upper.com[:, None])
-        self._upper_inertia = constant(upper.about_origin())
-        self._straight_com = constant((upper.mass * upper.com + self._leg_mass * hip.sum(0))[:, None] / self.mass)
+        upper, leg = moments([0, 1, 4], np.zeros(3)), thigh + shank
+        self._leg_mass, self._shank_mass = float(leg[3, 3]), float(shank[3, 3])
+        self.mass = float(upper[3, 3]) + 2.0 * self._leg_mass  # [kg]
+        self._thigh_moment = float(thigh[2, 3])
+        self._shank_height = float(shank[2, 3]) / self._shank_mass
+        self._across = float(leg[1, 1] + leg[2, 2]) - self._shank_mass * self._shank_height**2
+        self._along = float(leg[0, 0] + leg[1, 1])
+        self._roll_inertia = float(roll[1, 1] + roll[2, 2])
+        self._upper_moment = constant(upper[:3, 3:])
+        self._upper_inertia = constant(np.trace(upper[:3, :3]) * np.eye(3) - upper[:3, :3])
+        self._straight_com = constant((upper[:3, 3:] + self._leg_mass * hip.sum(0)[:, None]) / self.mass)
 
     def __call__(self, joint_pos: Tensor, joint_vel: Tensor, ang_vel: Tensor) -> Motion:
         r"""Return where the mass is and how it moves, from the momentum P and the angular momentum L about the trunk's origin.
@@ -201,34 +206,6 @@ def rotate_back(frame: Tensor, vec: Tensor) -> Tensor:
     return (frame * vec[:, None]).sum(0)
 
 
-@dataclass(frozen=True)
-class Inertial:
-    """Mass [kg], centre of mass [m] and inertia about it [kg m^2] of bodies that move as one."""
-
-    mass: float
-    com: NDArray[np.float64]
-    inertia: NDArray[np.float64]
-
-    @staticmethod
-    def of(model: mujoco.MjModel, data: mujoco.MjData, bodies: NDArray[np.int_]) -> "Inertial":
-        """Take the bodies together in the model's present pose."""
-        mass = model.body_mass[bodies]
-        com = mass @ data.xipos[bodies] / mass.sum()
-        inertia = np.zeros((3, 3))
-        for body, m in zip(bodies, mass, strict=True):
-            frame = data.ximat[body].reshape(3, 3)
-            inertia += frame @ np.diag(model.body_inertia[body]) @ frame.T + _point(m, data.xipos[body] - com)
-        return Inertial(float(mass.sum()), com, inertia)
-
-    def about_origin(self) -> NDArray[np.float64]:
-        """Return the inertia about the origin (parallel axes)."""
-        return self.inertia + _point(self.mass, self.com)
-
-
-def _point(mass: float, pos: NDArray[np.float64]) -> NDArray[np.float64]:
-    return mass * (pos @ pos * np.eye(3) - np.outer(pos, pos))
-
-
 def _link(model: mujoco.MjModel, body: int) -> int:
     """Return 1 + the place in `JOINTS` of the last joint between the trunk and this body; 0 for the trunk, -1 for the world."""
     while body:
@@ -240,24 +217,28 @@ def _link(model: mujoco.MjModel, body: int) -> int:
 
 
 def _check_legs(
-    robot: Robot, data: mujoco.MjData, hip: NDArray, foot: NDArray, right: list[Inertial], left: list[Inertial]
+    robot: Robot, data: mujoco.MjData, hip: NDArray, foot: NDArray, right: list[NDArray], left: list[NDArray]
 ) -> None:
-    """Raise if the legs are not mirror images of each other, built from rods and round hip links along the right axes."""
+    """Raise if the legs, of these moments of mass, are not mirror images, of rods and round hip links along the right axes."""
     joints = [robot.model.joint(name).id for name in JOINTS]
-    inertia = [link.inertia for link in (*right, *left)]
     as_expected = (
         np.allclose(data.xaxis[joints], np.concatenate([np.eye(3)] * 2))
         and np.allclose(data.xanchor[joints][[1, 4]], hip)
         and np.allclose(hip[0], hip[1] * [1, -1, 1])
         and np.allclose((foot - hip)[:, :2], 0.0)
-        and all(np.allclose((link.com - hip[side])[:2], 0.0) for side in (0, 1) for link in (right, left)[side])
-        and all(np.allclose(link.com, hip[side]) for side, link in enumerate((right[0], left[0])))
-        and all(np.allclose(i, np.diag(np.diag(i)), atol=1e-9) for i in inertia)
-        and all(np.isclose(i[1, 1], i[j, j]) for i, j in zip(inertia, (2, 0, 0) * 2, strict=True))
-        and all(np.isclose(a.mass, b.mass) and np.allclose(a.inertia, b.inertia) for a, b in zip(right, left, strict=True))
+        and np.allclose(right, left)
+        and all(_is_round(link, axis) for link, axis in zip(right, (0, 2, 2), strict=True))
+        and np.allclose(right[0][:3, 3], 0.0)
     )
     if not as_expected:
         raise UserError(
             f"{robot.path}: the model-based walkers need two like legs of hip roll (x), hip pitch (y) through the same point, "
             "and a knee along the leg (z), with the foot and all mass on the leg's axis"
         )
+
+
+def _is_round(moments: NDArray, axis: int) -> bool:
+    """Whether moments of mass are the same in all directions across an axis through their origin, and no others are there."""
+    (a, b), others = (i for i in range(3) if i != axis), moments - np.diag(np.diag(moments))
+    others[[axis, 3], [3, axis]] = 0.0
+    return np.allclose(others, 0.0, atol=1e-9) and np.isclose(moments[a, a], moments[b, b])

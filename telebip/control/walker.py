@@ -16,6 +16,7 @@ from telebip.control.config import WalkerConfig
 from telebip.control.kinematics import Kinematics, Motion, cross, joint_forces, leg_axis, rotate, rotate_back
 from telebip.control.legs import Hold, stance_force, swing_path
 from telebip.control.pendulum import Pendulum, Placement, Step
+from telebip.env import TelebipEnv
 from telebip.math import matrix, wrap_angle
 
 ESTIMATE = {
@@ -46,35 +47,21 @@ class Body:
 class Walker:
     """A `Policy` that places its feet by a law for the linear inverted pendulum, at whatever rate it is called."""
 
-    def __init__(
-        self,
-        cfg: WalkerConfig,
-        place: Placement,
-        kinematics: Kinematics,
-        nominal: Tensor,
-        action_scale: Tensor,
-        num_envs: int,
-        step_dt: float,
-    ) -> None:
-        """Create the walkers of all worlds.
+    def __init__(self, cfg: WalkerConfig, place: Placement, env: TelebipEnv) -> None:
+        """Create the walkers of all worlds of `env`, which place their feet by the law `place`.
 
-        Args:
-            cfg: parameters.
-            place: foot placement law.
-            kinematics: of the robot.
-            nominal: joint positions of the home pose [rad | m], (6,).
-            action_scale: joint displacement per unit of action [rad | m], (6,).
-            num_envs: number of worlds.
-            step_dt: time between two calls [s].
+        Raises:
+            UserError: the walkers cannot use the robot's legs.
         """
-        self.cfg, self.place, self.kinematics, self.step_dt = cfg, place, kinematics, step_dt
-        self.hold = Hold(kinematics.stiffness, kinematics.damping, kinematics.force_limit, step_dt)
-        self._nominal, self._action_scale = nominal[:, None], action_scale[:, None]
+        self.cfg, self.place, self.step_dt = cfg, place, env.step_dt
+        self.kinematics = Kinematics(env.robot, env.device)
+        self.hold = Hold(self.kinematics.stiffness, self.kinematics.damping, self.kinematics.force_limit, env.step_dt)
+        self._nominal, self._action_scale = env.world.nominal[:, None], env.world.action_scale[:, None]
 
         def zeros(*shape: int) -> Tensor:
-            return torch.zeros(*shape, num_envs, device=nominal.device)
+            return torch.zeros(*shape, env.num_envs, device=env.device)
 
-        self._is_new = torch.ones(num_envs, dtype=torch.bool, device=nominal.device)
+        self._is_new = torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
         self._heading = zeros()  # of the plan frame, relative to the reference heading [rad]
         self._side = zeros()  # s: +1 in left stance, -1 in right stance
         self._phase = zeros()  # sigma, fraction of the step that has passed

@@ -3,40 +3,21 @@
 Forces are those of a `Rollout`: means over a policy step (20 ms), so that a 5 ms impact counts for what it carries.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.floating]
 
-CONTACT = 0.05
-"""A foot is on the ground where it carries more than this many body weights."""
-
+CONTACT = 0.05  # body weights: a foot that carries more is on the ground
 LONGEST_PERIOD = 1.5  # s, the longest one looked for
 RHYTHM = 0.3  # autocorrelation below which there is no period to speak of
 HARMONICS = 8  # of the gait frequency, in the comparison of left and right
 
 
-@dataclass(frozen=True)
-class GaitSummary:
-    """Means over worlds."""
-
-    period_s: float  # of one stride (two steps); NaN without a rhythm
-    regularity: float  # see `rhythm` [-]
-    symmetry: float  # see `symmetry_index` [-]
-    duty_factor: float  # share of the time that a foot is on the ground [-]
-    double_support: float  # share of the time that both are [-]
-    flight: float  # share of the time that neither is [-]
-    peak_force_bw: float  # mean over strides of a foot's largest force [body weights]
-    stride_length_m: float  # mean speed x period
-    knee_stroke_m: float  # mean over strides of the travel that a prismatic knee uses; NaN without one
-
-
 def summarise_gait(
     foot_force: Array, knee_pos: Array, speed: float, weight: float, step_dt: float, clock: float
-) -> GaitSummary:
-    """Describe how a robot steps.
+) -> dict[str, float]:
+    """Describe how a robot steps: means over worlds, by name.
 
     Args:
         foot_force: normal forces on the right and the left foot [N], (steps, num_envs, 2).
@@ -50,17 +31,18 @@ def summarise_gait(
     stride = clock if np.isnan(period) else period
     down = foot_force > CONTACT * weight
     steps = max(1, round(stride / step_dt))
-    return GaitSummary(
-        period_s=period,
-        regularity=regularity,
-        symmetry=symmetry_index(foot_force, stride, step_dt),
-        duty_factor=float(down.mean()),
-        double_support=float(down.all(-1).mean()),
-        flight=float((~down).all(-1).mean()),
-        peak_force_bw=float(_strides(foot_force, steps).max(1).mean()) / weight,
-        stride_length_m=abs(speed) * stride,
-        knee_stroke_m=float(np.ptp(_strides(knee_pos, steps), axis=1).mean()) if knee_pos.size else float("nan"),
-    )
+    return {
+        "period_s": period,  # of one stride (two steps); NaN without a rhythm
+        "regularity": regularity,  # see `rhythm` [-]
+        "symmetry": symmetry_index(foot_force, stride, step_dt),  # [-]
+        "duty_factor": float(down.mean()),  # share of the time that a foot is on the ground [-]
+        "double_support": float(down.all(-1).mean()),  # share of the time that both are [-]
+        "flight": float((~down).all(-1).mean()),  # share of the time that neither is [-]
+        "peak_force_bw": float(_strides(foot_force, steps).max(1).mean()) / weight,  # of a foot, mean over strides
+        "stride_length_m": abs(speed) * stride,
+        # travel that a prismatic knee uses, mean over strides; NaN without one
+        "knee_stroke_m": float(np.ptp(_strides(knee_pos, steps), axis=1).mean()) if knee_pos.size else float("nan"),
+    }
 
 
 def rhythm(foot_force: Array, step_dt: float) -> tuple[float, float]:
@@ -68,9 +50,9 @@ def rhythm(foot_force: Array, step_dt: float) -> tuple[float, float]:
 
         R(k) = mean_t d(t) d(t + k) / mean_t d(t)^2,    period = k* dt,    regularity = R(k*)
 
-    with k* the first of the high peaks (at least 0.9 of the highest), refined between samples by a parabola. The difference of
-    the feet alternates in sign within one stride, so that one stride, not one step, is its period. Regularity is 1 where
-    every stride repeats the one before, and falls with whatever differs from stride to stride.
+    with k* the first of the high peaks (at least 0.9 of the highest), refined between samples by a parabola. d alternates in
+    sign within one stride, so that one stride, not one step, is its period. Regularity is 1 where every stride repeats the
+    one before.
 
     Args:
         foot_force: normal forces on the right and the left foot [N], (steps, num_envs, 2).
@@ -80,12 +62,12 @@ def rhythm(foot_force: Array, step_dt: float) -> tuple[float, float]:
         Period [s], median over the worlds that have one, NaN if there are fewer than two periods or half of the worlds have
         no rhythm (R < 0.3); regularity, mean over worlds, 0 for those without a peak.
     """
-    d = (foot_force[..., 0] - foot_force[..., 1]).astype(float)
-    d = d - d.mean(0)
-    lags = min(round(LONGEST_PERIOD / step_dt), len(d) // 2)
-    energy = (d * d).mean(0)
+    lags = min(round(LONGEST_PERIOD / step_dt), len(foot_force) // 2)
     if lags < 3:
         return float("nan"), float("nan")
+    d = (foot_force[..., 0] - foot_force[..., 1]).astype(float)
+    d -= d.mean(0)
+    energy = (d * d).mean(0)
     with np.errstate(invalid="ignore", divide="ignore"):
         correlation = np.array([(d[: len(d) - k] * d[k:]).mean(0) / energy for k in range(lags + 1)])
     found = [_first_peak(column) for column in correlation.T]
@@ -100,9 +82,8 @@ def symmetry_index(foot_force: Array, period: float, step_dt: float) -> float:
         S = 2 <c_r, c_l'> / (<c_r, c_r> + <c_l', c_l'>) = 1 - ||c_r - c_l'||^2 / (||c_r||^2 + ||c_l'||^2)
 
     c_r and c_l' are the Fourier coefficients of q_rf(t) and q_lf(t + T/2) at the first harmonics of the gait frequency,
-    fitted by least squares. The shift is exact (it changes the sign of the odd harmonics), though half a period is seldom a
-    whole number of samples. S is 1 for a perfectly alternating gait, falls with differences of timing, shape and size alike,
-    and is 0 where one foot alone carries.
+    fitted by least squares; the shift changes the sign of the odd ones. S is 1 for a perfectly alternating gait, falls with
+    differences of timing, shape and size alike, and is 0 where one foot alone carries.
 
     Args:
         foot_force: normal forces on the right and the left foot [N], (steps, num_envs, 2).
@@ -114,12 +95,10 @@ def symmetry_index(foot_force: Array, period: float, step_dt: float) -> float:
     """
     angle = 2.0 * np.pi / period * step_dt * np.arange(len(foot_force))
     orders = np.arange(1, min(HARMONICS, int(0.5 * period / step_dt - 1e-9)) + 1)
-    basis = np.concatenate(
-        [np.full((len(angle), 1), np.sqrt(0.5)), np.cos(np.outer(angle, orders)), np.sin(np.outer(angle, orders))], 1
-    )
-    shift = np.concatenate([[1.0], (-1.0) ** orders, (-1.0) ** orders])
+    waves = np.outer(angle, orders)
+    basis = np.concatenate([np.full((len(angle), 1), np.sqrt(0.5)), np.cos(waves), np.sin(waves)], axis=1)
     right, left = (np.linalg.lstsq(basis, foot_force[..., foot].astype(float), rcond=None)[0] for foot in range(2))
-    left = shift[:, None] * left
+    left *= np.concatenate([[1.0], (-1.0) ** orders, (-1.0) ** orders])[:, None]
     energy = (right**2 + left**2).sum(0)
     return float((2.0 * (right * left).sum(0) / np.where(energy > 0.0, energy, 1.0)).mean())
 
@@ -130,7 +109,7 @@ def _first_peak(correlation: Array) -> tuple[float, float]:
     peaks = 1 + np.flatnonzero((inner > correlation[:-2]) & (inner >= correlation[2:]) & (inner > 0.0))
     if not len(peaks):
         return float("nan"), 0.0
-    k = peaks[np.flatnonzero(correlation[peaks] >= 0.9 * correlation[peaks].max())[0]]
+    k = peaks[np.argmax(correlation[peaks] >= 0.9 * correlation[peaks].max())]
     left, middle, right = correlation[k - 1 : k + 2]
     offset = 0.5 * (left - right) / (left - 2.0 * middle + right)
     return float(k + offset), float(middle - 0.25 * (left - right) * offset)

@@ -21,8 +21,7 @@ def learning_curve(run_dir: Path, points: int = 200) -> dict[str, Any] | None:
 
     Returns:
         `samples` and one list for each of `COLUMNS`, the last row among them; `samples_to_95_length` and
-        `samples_to_95_return`. None if the folder has no learning curve (a policy that was copied out of its run), or an
-        empty one.
+        `samples_to_95_return`. None if the folder has no learning curve, or an empty one.
 
     Raises:
         UserError: the file is damaged.
@@ -50,11 +49,8 @@ def learning_curve(run_dir: Path, points: int = 200) -> dict[str, Any] | None:
 def samples_to(samples: list[float], curve: list[float], share: float = 0.95, final: int = 10) -> float | None:
     """Return the samples after which a curve first reached a share of its final value, the mean of its last `final` rows.
 
-    Returns:
-        Environment steps; None for an empty curve or one whose final value is not positive.
+    None for an empty curve or one whose final value is not positive.
     """
     last = [value for value in curve[-final:] if value == value]
     goal = share * sum(last) / len(last) if last else 0.0
-    if goal <= 0.0:
-        return None
-    return next((s for s, value in zip(samples, curve, strict=True) if value >= goal), None)
+    return next((s for s, value in zip(samples, curve, strict=True) if value >= goal > 0.0), None)

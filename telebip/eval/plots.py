@@ -1,14 +1,12 @@
 """The report's plots. Each takes results as `telebip.eval.suites.evaluate` returns them and draws what they hold."""
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 Results = dict[str, Any]
@@ -30,21 +28,16 @@ STYLE: Any = {
     "legend.frameon": False,
     "svg.hashsalt": "telebip",  # the same numbers give the same file
 }
+BESIDE: Any = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}  # a legend's place
 
 
+@rc_context(STYLE)
 def svg(figure: Figure) -> str:
-    """Return a figure as an SVG element, and close it."""
+    """Return a figure as an SVG element."""
     buffer = io.StringIO()
-    with plt.rc_context(STYLE):
-        figure.savefig(buffer, format="svg", bbox_inches="tight", metadata={"Date": None})
-    plt.close(figure)
+    figure.savefig(buffer, format="svg", bbox_inches="tight", metadata={"Date": None})
     text = buffer.getvalue()
     return text[text.index("<svg") :]
-
-
-def close(figure: Figure) -> None:
-    """Forget a figure that is not to be drawn."""
-    plt.close(figure)
 
 
 def named(results: Results) -> str:
@@ -58,155 +51,151 @@ def color(index: int, label: str) -> str:
     return GREYS[index % len(GREYS)] if label.startswith("article") else COLORS[index % len(COLORS)]
 
 
+@rc_context(STYLE)
 def speed(results: Results) -> Figure:
     """Mean forward speed against time, with the command."""
-    series = results["series"]["speed"]
-    with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(figsize=(7.2, 2.8))
-        commands = [name for name in series if name != "time_s"]
-        for i, name in enumerate(commands):
-            axes.plot(series["time_s"], series[name], color=COLORS[i % len(COLORS)], lw=1.4, label=f"{float(name):g} m/s")
-            axes.axhline(float(name), color=COLORS[i % len(COLORS)], lw=0.9, ls=(0, (4, 3)))
-        axes.axvspan(0, results["protocol"]["skip_s"], color="#f3f4f6", zorder=0)
-        axes.set(xlabel="time [s]", ylabel="speed [m/s]", title=f"{named(results)}: speed, and what was commanded (dashed)")
-        axes.set_xlim(0, series["time_s"][-1])
-        axes.legend(ncols=len(commands), loc="lower right")
+    figure = Figure((7.2, 2.8))
+    axes, series = figure.subplots(), results["series"]["speed"]
+    commands = [name for name in series if name != "time_s"]
+    for i, name in enumerate(commands):
+        axes.plot(series["time_s"], series[name], color=COLORS[i % len(COLORS)], lw=1.4, label=f"{float(name):g} m/s")
+        axes.axhline(float(name), color=COLORS[i % len(COLORS)], lw=0.9, ls=(0, (4, 3)))
+    axes.axvspan(0, results["protocol"]["skip_s"], color="#f3f4f6", zorder=0)
+    axes.set(xlabel="time [s]", ylabel="speed [m/s]", xlim=(0, series["time_s"][-1]))
+    axes.set_title(f"{named(results)}: speed, and what was commanded (dashed)")
+    axes.legend(ncols=len(commands), loc="lower right")
     return figure
 
 
+@rc_context(STYLE)
 def feet(results: Results) -> Figure:
     """Force on each foot over two seconds, with the half periods in which the phase signal asks for it."""
-    s = results["series"]["feet"]
-    time = np.array(s["time_s"])
-    with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(figsize=(7.2, 2.3))
-        phase = np.array(s["phase_right"])
-        top = 1.25 * max(*s["right_bw"], *s["left_bw"], 0.1)  # room for the legend
-        axes.fill_between(time, 0, top, where=(phase > 0).tolist(), step="mid", color=COLORS[0], alpha=0.08, lw=0)
-        axes.fill_between(time, 0, top, where=(phase < 0).tolist(), step="mid", color=COLORS[1], alpha=0.08, lw=0)
-        axes.plot(time, s["right_bw"], color=COLORS[0], lw=1.5, label="right foot")
-        axes.plot(time, s["left_bw"], color=COLORS[1], lw=1.5, label="left foot")
-        axes.set(xlabel="time [s]", ylabel="force [body weights]", ylim=(0, top))
-        axes.set_title(f"{named(results)}: forces on the feet at {s['command_mps']:g} m/s (shaded: whose turn it is)")
-        axes.set_xlim(time[0], time[-1])
-        axes.legend(ncols=2, loc="upper right")
+    figure = Figure((7.2, 2.3))
+    axes, s = figure.subplots(), results["series"]["feet"]
+    time, phase = np.array(s["time_s"]), np.array(s["phase_right"])
+    top = 1.25 * max(*s["right_bw"], *s["left_bw"], 0.1)  # room for the legend
+    for foot, turn, tone in (("right", phase > 0, COLORS[0]), ("left", phase < 0, COLORS[1])):
+        axes.fill_between(time, 0, top, where=turn.tolist(), step="mid", color=tone, alpha=0.08, lw=0)
+        axes.plot(time, s[f"{foot}_bw"], color=tone, lw=1.5, label=f"{foot} foot")
+    axes.set(xlabel="time [s]", ylabel="force [body weights]", xlim=(time[0], time[-1]), ylim=(0, top))
+    axes.set_title(f"{named(results)}: forces on the feet at {s['command_mps']:g} m/s (shaded: whose turn it is)")
+    axes.legend(ncols=2, loc="upper right")
     return figure
 
 
+@rc_context(STYLE)
 def cost_of_transport(all_results: Sequence[Results], commands: Sequence[float] = (0.5, 0.7, 1.0)) -> Figure:
     """Cost of transport by method and commanded speed, where most worlds walk on; by the formula that the article reports."""
-
-    def walks_on(row: dict[str, Any]) -> bool:
-        return row.get("falls", 0) <= row.get("worlds", 0) / 2
-
-    costs_of = [{row["command_mps"]: row["cot_article"] for row in r.get("tracking", ()) if walks_on(row)} for r in all_results]
-    shown = [k for k, costs in enumerate(costs_of) if costs.keys() & set(commands)]
-    with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(figsize=(7.2 + 0.6 * max(0, len(shown) - 6), 3.0))
-        width = 0.84 / max(1, len(shown))
-        for i, k in enumerate(shown):
-            results, costs = all_results[k], costs_of[k]
-            x = [at + (i - 0.5 * (len(shown) - 1)) * width for at, command in enumerate(commands) if command in costs]
-            y = [costs[command] for command in commands if command in costs]
-            bars = axes.bar(x, y, 0.92 * width, color=color(k, results["label"]), label=named(results))
-            axes.bar_label(bars, fmt="%.2f", fontsize=7, padding=1)
-        axes.set_xticks(range(len(commands)), [f"{command:.1f} m/s" for command in commands])
-        axes.grid(axis="x", visible=False)
-        axes.set(ylabel="cost of transport [-]", title="Cost of transport (lower is better)")
-        if shown:
-            axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    costs = []
+    for results in all_results:
+        walks_on = [row for row in results.get("tracking", ()) if row.get("falls", 0) <= row.get("worlds", 0) / 2]
+        cost = {row["command_mps"]: row["cot_article"] for row in walks_on}
+        costs.append({at: cost[command] for at, command in enumerate(commands) if command in cost})
+    figure = Figure((7.2 + 0.6 * max(0, sum(map(bool, costs)) - 6), 3.0))
+    axes = figure.subplots()
+    _bars(axes, all_results, costs, [f"{command:.1f} m/s" for command in commands], "%.2f")
+    axes.set(ylabel="cost of transport [-]", title="Cost of transport (lower is better)")
     return figure
 
 
+@rc_context(STYLE)
 def push(all_results: Sequence[Results], horizon: str = "10s") -> Figure:
     """Largest push survived, by method and direction."""
-    shown = [(k, r) for k, r in enumerate(all_results) if horizon in (r.get("push") or {})]
-    directions = ("forward", "backward", "lateral")
-    with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(figsize=(7.2, 3.0))
-        width = 0.84 / max(1, len(shown))
-        for i, (k, results) in enumerate(shown):
-            x = [at + (i - 0.5 * (len(shown) - 1)) * width for at in range(3)]
-            values = [results["push"][horizon][f"{name}_n"] for name in directions]
-            bars = axes.bar(x, values, 0.92 * width, color=color(k, results["label"]), label=named(results))
-            axes.bar_label(bars, fmt="%.0f", fontsize=7, padding=1)
-        axes.set_xticks(range(3), ["forward", "backward", "lateral (worse side)"])
-        axes.grid(axis="x", visible=False)
-        axes.set(ylabel="force for 0.1 s [N]", title=f"Largest push survived during {horizon.removesuffix('s')} s of walking")
-        axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    figure = Figure((7.2, 3.0))
+    axes, limits = figure.subplots(), [(results.get("push") or {}).get(horizon) for results in all_results]
+    directions = list(enumerate(("forward", "backward", "lateral")))
+    forces = [{at: limit[f"{name}_n"] for at, name in directions} if limit else {} for limit in limits]
+    _bars(axes, all_results, forces, ["forward", "backward", "lateral (worse side)"], "%.0f")
+    axes.set(ylabel="force for 0.1 s [N]", title=f"Largest push survived during {horizon.removesuffix('s')} s of walking")
     return figure
 
 
+def _bars(
+    axes: Axes, all_results: Sequence[Results], heights: Sequence[Mapping[int, float]], ticks: list[str], digits: str
+) -> None:
+    """Draw a group of bars at every tick, one for each method that has any of `heights`, which are by the tick's index."""
+    shown = [k for k, height in enumerate(heights) if height]
+    width = 0.84 / max(1, len(shown))
+    for i, k in enumerate(shown):
+        x = [at + (i - 0.5 * (len(shown) - 1)) * width for at in heights[k]]
+        tone = color(k, all_results[k]["label"])
+        bars = axes.bar(x, list(heights[k].values()), 0.92 * width, color=tone, label=named(all_results[k]))
+        axes.bar_label(bars, fmt=digits, fontsize=7, padding=1)
+    axes.set_xticks(range(len(ticks)), ticks)
+    axes.grid(axis="x", visible=False)
+    if shown:
+        axes.legend(**BESIDE)
+
+
+@rc_context(STYLE)
 def joints(results: Results) -> Figure:
     """Where the energy goes: each actuator's share of the cost of transport."""
     rows = results["tracking"]
-    with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(figsize=(7.2, 0.7 + 0.42 * len(rows)))
-        names = list(rows[0]["cot_joints"])
-        left = np.zeros(len(rows))
-        kinds = list(dict.fromkeys(name.removeprefix("right_").removeprefix("left_") for name in names))
-        for name in names:
-            cost = np.array([row["cot_joints"][name] or 0.0 for row in rows])
-            tone = COLORS[kinds.index(name.removeprefix("right_").removeprefix("left_")) % len(COLORS)]
-            alpha = 0.55 if name.startswith("left_") else 1.0
-            axes.barh(range(len(rows)), cost, left=left, color=tone, alpha=alpha, label=name.replace("_", " "))
-            left += cost
-        axes.set_yticks(range(len(rows)), [f"{row['command_mps']:g} m/s" for row in rows])
-        axes.invert_yaxis()
-        axes.grid(axis="y", visible=False)
-        axes.set(xlabel="cost of transport [-]", title=f"{named(results)}: which actuator pays")
-        axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=7)
+    figure = Figure((7.2, 0.7 + 0.42 * len(rows)))
+    axes, left = figure.subplots(), np.zeros(len(rows))
+    kinds: list[str] = []
+    for name in rows[0]["cot_joints"]:
+        kind = name.removeprefix("right_").removeprefix("left_")
+        kinds += [] if kind in kinds else [kind]
+        cost = np.array([row["cot_joints"][name] or 0.0 for row in rows])
+        tone, alpha = COLORS[kinds.index(kind) % len(COLORS)], 0.55 if name.startswith("left_") else 1.0
+        axes.barh(range(len(rows)), cost, left=left, color=tone, alpha=alpha, label=name.replace("_", " "))
+        left += cost
+    axes.set_yticks(range(len(rows)), [f"{row['command_mps']:g} m/s" for row in rows])
+    axes.invert_yaxis()
+    axes.grid(axis="y", visible=False)
+    axes.set(xlabel="cost of transport [-]", title=f"{named(results)}: which actuator pays")
+    axes.legend(**BESIDE, fontsize=7)
     return figure
 
 
+@rc_context(STYLE)
 def learning(all_results: Sequence[Results]) -> Figure:
     """Episode length and velocity error against samples."""
-    shown = [(i, r) for i, r in enumerate(all_results) if r.get("learning")]
-    with plt.rc_context(STYLE):
-        figure, (left, right) = plt.subplots(1, 2, figsize=(9.2, 2.8))
-        for i, results in shown:
-            curve = results["learning"]
+    figure = Figure((9.2, 2.8))
+    left, right = figure.subplots(1, 2)
+    for i, results in enumerate(all_results):
+        if curve := results.get("learning"):
             samples = np.array(curve["samples"]) / 1e6
             for axes, name in ((left, "episode_length"), (right, "velocity_error_mps")):
-                values = np.array([np.nan if v is None else v for v in curve[name]], dtype=float)
+                values = np.array(curve[name], dtype=float)  # None becomes NaN
                 axes.plot(samples, values, color=color(i, results["label"]), lw=1.4, label=named(results))
-        left.set(xlabel="million samples", ylabel="policy steps", title="Length of training episodes")
-        right.set(xlabel="million samples", ylabel="m/s", title="Velocity error in training")
-        for axes in (left, right):
-            axes.set_ylim(bottom=0)
-        right.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    left.set(xlabel="million samples", ylabel="policy steps", title="Length of training episodes", ylim=(0, None))
+    right.set(xlabel="million samples", ylabel="m/s", title="Velocity error in training", ylim=(0, None))
+    right.legend(**BESIDE)
     return figure
 
 
+@rc_context(STYLE)
 def throughput(rows: Sequence[dict[str, Any]], title: str) -> Figure:
     """Environment steps per second against the number of worlds, as `telebip.tools.benchmark.measure` returns them."""
     stages = {"engine": "physics engine alone", "env": "environment", "collect": "with the policy", "train": "training"}
     worlds = [row["num_envs"] for row in rows]
-    with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(figsize=(7.2, 3.4))
-        for i, (stage, label) in enumerate(stages.items()):
-            rates = [row[f"{stage}_env_steps_per_s"] for row in rows]
-            axes.plot(worlds, rates, "o-", color=COLORS[i], lw=1.4, ms=4, label=label)
-        axes.set_xscale("log", base=2)
-        axes.set_xticks(worlds, [str(number) for number in worlds])
-        axes.minorticks_off()
-        axes.set(xlabel="worlds", ylabel="environment steps per second", title=title)
-        axes.set_ylim(bottom=0)
-        axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    figure = Figure((7.2, 3.4))
+    axes = figure.subplots()
+    for i, (stage, label) in enumerate(stages.items()):
+        rates = [row[f"{stage}_env_steps_per_s"] for row in rows]
+        axes.plot(worlds, rates, "o-", color=COLORS[i], lw=1.4, ms=4, label=label)
+    axes.set_xscale("log", base=2)
+    axes.set_xticks(worlds, [str(number) for number in worlds])
+    axes.minorticks_off()
+    axes.set(xlabel="worlds", ylabel="environment steps per second", title=title, ylim=(0, None))
+    axes.legend(**BESIDE)
     return figure
 
 
+@rc_context(STYLE)
 def race(races: Sequence[dict[str, Any]], title: str) -> Figure:
     """Return of the episodes against samples and against time, one line a seed, of `telebip.tools.race.race`."""
-    with plt.rc_context(STYLE):
-        figure, (left, right) = plt.subplots(1, 2, figsize=(9.2, 2.8), sharey=True)
-        for i, (name, label) in enumerate({"telebip": "telebip", "stock": "rsl-rl's PPO in float32"}.items()):
-            for k, result in enumerate(races):
-                returns = np.array(result[name]["episode_return"], dtype=float)
-                minutes = np.cumsum(result[name]["seconds"]) / 60.0
-                left.plot(np.array(result["samples"]) / 1e6, returns, color=COLORS[i], lw=1.1, label=label if k == 0 else None)
-                right.plot(minutes, returns, color=COLORS[i], lw=1.1)
-        left.set(xlabel="million samples", ylabel="return of an episode", title=title)
-        right.set(xlabel="minutes of collecting and learning")
-        left.legend(loc="upper left")
+    figure = Figure((9.2, 2.8))
+    left, right = figure.subplots(1, 2, sharey=True)
+    for i, (name, label) in enumerate({"telebip": "telebip", "stock": "rsl-rl's PPO in float32"}.items()):
+        for k, result in enumerate(races):
+            returns = np.array(result[name]["episode_return"], dtype=float)
+            minutes = np.cumsum(result[name]["seconds"]) / 60.0
+            left.plot(np.array(result["samples"]) / 1e6, returns, color=COLORS[i], lw=1.1, label=label if k == 0 else None)
+            right.plot(minutes, returns, color=COLORS[i], lw=1.1)
+    left.set(xlabel="million samples", ylabel="return of an episode", title=title)
+    right.set(xlabel="minutes of collecting and learning")
+    left.legend(loc="upper left")
     return figure

@@ -20,8 +20,8 @@ DIRECTIONS = {"forward": (1.0, 0.0), "backward": (-1.0, 0.0), "left": (0.0, 1.0)
 class PushProtocol:
     """A force on the trunk's centre of mass, again and again while the robot walks.
 
-    The first push comes `warmup` seconds after the start plus a random part of the interval, so that with an interval that is
-    no multiple of the gait period the pushes meet all phases of the gait.
+    The first push comes a random part of the interval after the warm-up: with an interval that is no multiple of the gait
+    period, pushes meet all phases of the gait.
     """
 
     command: float = 0.7  # m/s, forward
@@ -50,12 +50,7 @@ class PushProtocol:
 
 
 def largest_survived(survived: NDArray[np.bool_], forces: NDArray[np.floating]) -> float:
-    """Return the largest force that all worlds survive, as they do every smaller one [N]; 0 if they fail at the first.
-
-    Args:
-        survived: (forces, worlds), in the order of `forces`.
-        forces: from the smallest up [N], (forces,).
-    """
+    """Return the largest of `forces` (ascending) below which no world falls [N], 0 if none; `survived` is (forces, worlds)."""
     passed = int(np.cumprod(survived.all(1)).sum())
     return float(forces[passed - 1]) if passed else 0.0
 
@@ -72,17 +67,18 @@ def push_limits(survival_s: NDArray[np.floating], protocol: PushProtocol, weight
     Returns:
         For each horizon ("10s"): `forward_n`, `backward_n`, `lateral_n` (of left and right the worse) [N], the same as impulses
         (`forward_ns` [N s]) and as fractions of the weight (`forward_bw` [-]); and `survivors`, how many worlds survive each
-        force, by direction: a limit may be low because of a single fall, or of a weakness for small pushes.
+        force, by direction.
     """
     table = {}
     for horizon in protocol.horizons:
-        limit = {name: largest_survived(survival_s[:, i] >= horizon, protocol.forces) for i, name in enumerate(DIRECTIONS)}
+        survived = {name: survival_s[:, i] >= horizon for i, name in enumerate(DIRECTIONS)}
+        limit = {name: largest_survived(worlds, protocol.forces) for name, worlds in survived.items()}
         force = {"forward": limit["forward"], "backward": limit["backward"], "lateral": min(limit["left"], limit["right"])}
         table[f"{horizon:g}s"] = {
             **{f"{name}_n": value for name, value in force.items()},
             **{f"{name}_ns": round(value * protocol.duration, 6) for name, value in force.items()},
             **{f"{name}_bw": round(value / weight, 4) for name, value in force.items()},
-            "survivors": {name: (survival_s[:, i] >= horizon).sum(1).tolist() for i, name in enumerate(DIRECTIONS)},
+            "survivors": {name: worlds.sum(1).tolist() for name, worlds in survived.items()},
         }
     return table
 

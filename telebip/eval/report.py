@@ -3,16 +3,17 @@
 import html
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
+
+from matplotlib.figure import Figure
 
 from telebip.errors import UserError
 from telebip.eval import plots
 
 Results = dict[str, Any]
-Table = tuple[str, list[str], list[list[str]]]
-"""Title, header and rows."""
+Table = tuple[str, list[str], list[list[str]]]  # title, header and rows
 
 
 def write_report(
@@ -31,12 +32,12 @@ def write_report(
     markdown = [f"# {title}", *([text] if text else [])]
     page = [f"<h1>{html.escape(title)}</h1>", *(f"<p>{html.escape(p)}</p>" for p in text.split("\n\n") if p)]
     for name, figure in _comparisons(all_results, references):
-        picture = plots.svg(figure())
+        picture = plots.svg(figure)
         write(out / f"{name}.svg", picture)
         markdown.append(f"![{name.replace('_', ' ')}]({name}.svg)")
         page.append(f"<figure>{picture}</figure>")
     markdown += [f"## {heading}\n\n{_markdown(header, rows)}" for heading, header, rows in tables]
-    page += [f"<figure>{plots.svg(figure())}</figure>" for figure in _figures_of_each(all_results)]
+    page += [f"<figure>{plots.svg(figure)}</figure>" for figure in _figures_of_each(all_results)]
     page += [f"<h2>{html.escape(heading)}</h2>{_html(header, rows)}" for heading, header, rows in tables]
     write(out / "report.md", "\n\n".join(markdown) + "\n")
     write(out / "report.html", _PAGE.format(title=html.escape(title), body="\n".join(page)))
@@ -65,9 +66,7 @@ def read_results(path: Path) -> Results:
 def can_be_shown(results: Results) -> bool:
     """Whether results hold all that tables and pictures show of them, which older and damaged ones may not."""
     try:
-        _tables([results])
-        for figure in (*(figure for _, figure in _comparisons([results], [])), *_figures_of_each([results])):
-            plots.close(figure())
+        _tables([results]), [*_comparisons([results], [])], [*_figures_of_each([results])]
     except (AttributeError, IndexError, KeyError, TypeError, ValueError):
         return False
     return True
@@ -99,68 +98,51 @@ def write(path: Path, text: str) -> None:
         raise UserError(f"cannot write '{path}': {error.strerror or error}") from error
 
 
-def _comparisons(all_results: Sequence[Results], references: Sequence[Results]) -> list[tuple[str, Callable[[], Any]]]:
-    """Return the pictures of all walkers together, with the names of their files."""
+def _comparisons(all_results: Sequence[Results], references: Sequence[Results]) -> Iterator[tuple[str, Figure]]:
+    """Draw all walkers together; yield each picture with the name of its file."""
     together = [*all_results, *references]
-    figures: list[tuple[str, Callable[[], Any]]] = []
-    if any("tracking" in r for r in all_results):
-        figures.append(("cost_of_transport", lambda: plots.cost_of_transport(together)))
+    if any("tracking" in results for results in all_results):
+        yield "cost_of_transport", plots.cost_of_transport(together)
     for horizon in ("10s", "20s"):
-        if any(horizon in (r.get("push") or {}) for r in all_results):
-            figures.append((f"push_{horizon}", lambda horizon=horizon: plots.push(together, horizon)))
-    if any(r.get("learning") for r in all_results):
-        figures.append(("learning", lambda: plots.learning(all_results)))
-    return figures
+        if any(horizon in (results.get("push") or {}) for results in all_results):
+            yield f"push_{horizon}", plots.push(together, horizon)
+    if any(results.get("learning") for results in all_results):
+        yield "learning", plots.learning(all_results)
 
 
-def _figures_of_each(all_results: Sequence[Results]) -> list[Callable[[], Any]]:
-    """Return the pictures of each walker alone."""
-    figures: list[Callable[[], Any]] = []
+def _figures_of_each(all_results: Sequence[Results]) -> Iterator[Figure]:
+    """Draw each walker alone."""
     for results in all_results:
         if "series" in results:
-            figures.append(lambda r=results: plots.speed(r))
-            figures.append(lambda r=results: plots.feet(r))
+            yield plots.speed(results)
+            yield plots.feet(results)
         if "tracking" in results:
-            figures.append(lambda r=results: plots.joints(r))
-    return figures
+            yield plots.joints(results)
 
 
 def _tables(all_results: Sequence[Results]) -> list[Table]:
-    def rows(suite: str, fill: Callable[[Any], list[list[str]]]) -> list[list[str]]:
-        return [[r["label"], *row] for r in all_results if r.get(suite) for row in fill(r[suite])]
+    def of(suite: str) -> list[tuple[str, Any]]:
+        return [(results["label"], results[suite]) for results in all_results if results.get(suite)]
 
-    horizons = sorted({h for r in all_results for h in (r.get("push") or {}) if h != "protocol"}, key=lambda h: float(h[:-1]))
+    tracking = ["walker", "command [m/s]", "mean speed [m/s]", "error", "RMS error [m/s]", "falls", "yaw drift [deg]"]
+    tracking += ["COT mechanical", "COT article", "COT positive"]
+    push = ["walker", "forward [N]", "backward [N]", "lateral [N]", "as impulse [N s]", "of body weight"]
+    gait = ["walker", "command [m/s]", "period [s]", "regularity", "symmetry", "duty factor", "double support", "flight"]
+    gait += ["peak force [body weights]", "stride [m]", "knee stroke [m]"]
+    learning = ["walker", "samples", "to 95 % of the final episode length", "to 95 % of the final return"]
+    horizons = sorted({h for _, limits in of("push") for h in limits if h != "protocol"}, key=lambda h: float(h[:-1]))
     return [
-        (
-            "Tracking and cost of transport",
-            ["walker", "command [m/s]", "mean speed [m/s]", "error", "RMS error [m/s]", "falls", "yaw drift [deg]"]
-            + ["COT mechanical", "COT article", "COT positive"],
-            rows("tracking", lambda suite: [_tracking_cells(row) for row in suite]),
-        ),
+        ("Tracking and cost of transport", tracking, [[k, *_tracking_cells(r)] for k, rows in of("tracking") for r in rows]),
         *(
             (
                 f"Largest push survived, {horizon.removesuffix('s')} s of walking",
-                ["walker", "forward [N]", "backward [N]", "lateral [N]", "as impulse [N s]", "of body weight"],
-                [[r["label"], *_push_cells(r["push"][horizon])] for r in all_results if horizon in (r.get("push") or {})],
+                push,
+                [[label, *_push_cells(limits[horizon])] for label, limits in of("push") if horizon in limits],
             )
             for horizon in horizons
         ),
-        (
-            "Gait",
-            ["walker", "command [m/s]", "period [s]", "regularity", "symmetry", "duty factor", "double support", "flight"]
-            + ["peak force [body weights]", "stride [m]", "knee stroke [m]"],
-            rows("gait", lambda suite: [[number(value, 3) for value in suite.values()]]),
-        ),
-        (
-            "Learning",
-            ["walker", "samples", "to 95 % of the final episode length", "to 95 % of the final return"],
-            rows(
-                "learning",
-                lambda s: [
-                    [_millions(s["samples"][-1]), _millions(s["samples_to_95_length"]), _millions(s["samples_to_95_return"])]
-                ],
-            ),
-        ),
+        ("Gait", gait, [[label, *(number(value, 3) for value in row.values())] for label, row in of("gait")]),
+        ("Learning", learning, [[label, *_learning_cells(curve)] for label, curve in of("learning")]),
     ]
 
 
@@ -173,9 +155,7 @@ def _tracking_cells(row: dict[str, Any]) -> list[str]:
         number(row.get("rms_error_mps"), 3),
         f"{row['falls']} of {row['worlds']}" if "falls" in row else "-",
         number(row.get("yaw_drift_deg"), 1),
-        number(row.get("cot_mechanical"), 3),
-        number(row.get("cot_article"), 3),
-        number(row.get("cot_positive"), 3),
+        *(number(row.get(f"cot_{formula}"), 3) for formula in ("mechanical", "article", "positive")),
     ]
 
 
@@ -188,13 +168,14 @@ def _push_cells(limits: dict[str, float]) -> list[str]:
     ]
 
 
+def _learning_cells(curve: dict[str, Any]) -> list[str]:
+    samples = (curve["samples"][-1], curve["samples_to_95_length"], curve["samples_to_95_return"])
+    return ["-" if value is None else f"{value / 1e6:.1f} M" for value in samples]
+
+
 def number(value: float | None, digits: int) -> str:
     """Return a number with its digits, and a dash where there is none."""
     return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
-
-
-def _millions(value: float | None) -> str:
-    return "-" if value is None else f"{value / 1e6:.1f} M"
 
 
 def _markdown(header: list[str], rows: list[list[str]]) -> str:

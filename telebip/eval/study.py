@@ -41,7 +41,4 @@ TRAININGS = (
     Training("telebip_backward", "RL, backward", "telebip_backward", SHORT),
 )
 
-BASELINES = (
-    Baseline("alip", "angular momentum", "alip"),
-    Baseline("dcm", "DCM", "dcm"),
-)
+BASELINES = (Baseline("alip", "angular momentum", "alip"), Baseline("dcm", "DCM", "dcm"))

@@ -1,7 +1,4 @@
-"""The evaluator: runs suites on anything that walks, and returns one table of results, ready for JSON.
-
-`docs/evaluation.md` describes every field of the results.
-"""
+"""The evaluator: runs suites on anything that walks, and returns results ready for JSON (fields: `docs/evaluation.md`)."""
 
 import dataclasses
 import platform
@@ -31,11 +28,8 @@ from telebip.rollout import Rollout, roll_out
 from telebip.sim import Backend, choose_backend
 
 SUITES = ("tracking", "push", "gait", "learning")
-COMMANDS = (0.5, 0.7, 1.0, -0.3)
-"""Forward speeds that the tracking suite asks for, where the policy was trained on them [m/s]."""
-
-Progress = Callable[[str, int, int], None]
-"""Called with what is running, the finished steps and their total."""
+COMMANDS = (0.5, 0.7, 1.0, -0.3)  # forward speeds of the tracking suite, where the policy was trained on them [m/s]
+Progress = Callable[[str, int, int], None]  # called with what is running, the finished steps and their total
 
 
 @dataclass(frozen=True)
@@ -83,11 +77,7 @@ def check_suites(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def evaluate(
-    candidate: Candidate,
-    robot: Robot,
-    suites: Sequence[str],
-    protocol: Protocol,
-    progress: Progress = lambda name, step, total: None,
+    candidate: Candidate, robot: Robot, suites: Sequence[str], protocol: Protocol, progress: Progress = lambda *args: None
 ) -> dict[str, Any]:
     """Run suites and return the results: plain numbers, texts, lists and dictionaries. Deterministic for the task's seed."""
     run_dir = candidate.run_dir if "learning" in suites else None
@@ -101,14 +91,14 @@ def evaluate(
         "date": datetime.now().astimezone().isoformat(timespec="seconds"),
         "machine": f"{platform.machine()}, {protocol.device}",
         "engine": choose_backend(protocol.backend, protocol.device),
-        "protocol": describe_protocol(candidate, protocol),
+        "protocol": _walking_protocol(candidate, protocol),
     }
-    if "tracking" in suites or "gait" in suites:
+    if {"tracking", "gait"} & set(suites):
         walks = _walk(candidate, robot, protocol, progress)
-        if "tracking" in suites:
-            results["tracking"] = [_tracking_row(command, walk, protocol.skip) for command, walk in walks.items()]
         command = min(walks, key=lambda speed: abs(speed - protocol.push.command))
         results["series"] = {"speed": _speed_series(walks), "feet": _feet_series(walks[command], command)}
+        if "tracking" in suites:
+            results["tracking"] = [_tracking_row(command, walk, protocol.skip) for command, walk in walks.items()]
         if "gait" in suites:
             results["gait"] = _gait(walks[command], robot, command, protocol.skip, candidate.task.gait.period)
     if "push" in suites:
@@ -118,7 +108,7 @@ def evaluate(
     return results
 
 
-def describe_protocol(candidate: Candidate, protocol: Protocol) -> dict[str, Any]:
+def _walking_protocol(candidate: Candidate, protocol: Protocol) -> dict[str, Any]:
     """Return how the walking suites are run, as results say it."""
     return {
         "worlds": protocol.worlds,
@@ -129,7 +119,7 @@ def describe_protocol(candidate: Candidate, protocol: Protocol) -> dict[str, Any
     }
 
 
-def push_protocol_of(candidate: Candidate, protocol: Protocol) -> PushProtocol:
+def _push_protocol(candidate: Candidate, protocol: Protocol) -> PushProtocol:
     """Return how the push suite is run: at a speed that the policy was trained on."""
     low, high = candidate.task.commands.lin_vel_x
     command = protocol.push.command if candidate.is_model_based else float(np.clip(protocol.push.command, low, high))
@@ -138,13 +128,13 @@ def push_protocol_of(candidate: Candidate, protocol: Protocol) -> PushProtocol:
 
 def is_current(results: dict[str, Any], candidate: Candidate, suites: Sequence[str], protocol: Protocol) -> bool:
     """Whether results from a file are what `evaluate` would measure again: all of the suites, of the same, in the same way."""
-    push = push_protocol_of(candidate, protocol)
-    pushed = {**asdict(push), "horizons": list(push.horizons)}
+    push = _push_protocol(candidate, protocol)
+    pushed = asdict(push) | {"horizons": list(push.horizons)}
     return (
         set(suites) <= results.keys()
         and all(results[suite] for suite in suites if suite != "learning")  # which may be null
         and results.get("fingerprint") == candidate.fingerprint
-        and results.get("protocol") == describe_protocol(candidate, protocol)
+        and results.get("protocol") == _walking_protocol(candidate, protocol)
         and ("push" not in suites or results["push"].get("protocol") == pushed)
     )
 
@@ -199,32 +189,31 @@ def _gait(rollout: Rollout, robot: Robot, command: float, skip: float, clock: fl
     speed = float(heading_velocity(kept.qpos, kept.qvel)[..., 0].mean(dtype=float))
     knees = [i for i, name in enumerate(robot.joint_names) if name.endswith("knee") and robot.is_slide[i]]
     summary = summarise_gait(kept.foot_force, kept.joint_pos[..., knees], speed, rollout.weight, rollout.step_dt, clock)
-    return {"command_mps": command, **{name: round(value, 5) for name, value in asdict(summary).items()}}
+    return {"command_mps": command, **{name: round(value, 5) for name, value in summary.items()}}
 
 
 def _push(candidate: Candidate, robot: Robot, protocol: Protocol, progress: Progress) -> dict[str, Any]:
-    push = push_protocol_of(candidate, protocol)
+    push = _push_protocol(candidate, protocol)
     env = make_env(candidate, robot, protocol, push.num_envs, push.seconds)
-    total = round(push.seconds / env.step_dt)
-    name = f"pushing {push.num_envs} worlds"
+    name, total = f"pushing {push.num_envs} worlds", round(push.seconds / env.step_dt)
     survival = push_trial(env, candidate.make_policy(env), push, lambda step: progress(name, step, total))
     return {"protocol": asdict(push), **push_limits(survival, push, robot.weight)}
 
 
-def _speed_series(walks: dict[float, Rollout], every: float = 0.1) -> dict[str, Any]:
+def _speed_series(walks: dict[float, Rollout]) -> dict[str, Any]:
     """Mean forward speed over the worlds against time, ten times a second, for each command."""
     first = next(iter(walks.values()))
-    rows = max(1, round(every / first.step_dt))
-    series: dict[str, Any] = {"time_s": _rounded(first.time[rows - 1 :: rows], 3)}
+    rows = max(1, round(0.1 / first.step_dt))
+    series = {"time_s": _rounded(first.time[rows - 1 :: rows], 3)}
     for command, walk in walks.items():
         speed = heading_velocity(walk.qpos, walk.qvel)[..., 0].mean(1)
-        series[f"{command:g}"] = _rounded([speed[i - rows + 1 : i + 1].mean() for i in range(rows - 1, len(speed), rows)], 4)
+        series[f"{command:g}"] = _rounded(speed[: len(speed) // rows * rows].reshape(-1, rows).mean(1), 4)
     return series
 
 
-def _feet_series(walk: Rollout, command: float, seconds: float = 2.0) -> dict[str, Any]:
+def _feet_series(walk: Rollout, command: float) -> dict[str, Any]:
     """Foot forces of the first world in the last two seconds [body weights], with the phase signals."""
-    rows = slice(-round(seconds / walk.step_dt), None)
+    rows = slice(-round(2.0 / walk.step_dt), None)
     force = walk.foot_force[rows, 0] / walk.weight
     return {
         "command_mps": command,

@@ -135,17 +135,15 @@ class Step:
     time after resets. What is derived from the state is computed at its first use, once.
     """
 
-    def __init__(
-        self,
-        world: World,
-        env: EnvState,
-        action: Tensor,
-        fallen: Tensor | None = None,
-    ) -> None:
-        """Look at the present values of `env` and of the simulator; `fallen` (num_envs,) bool, where that is known."""
+    def __init__(self, world: World, env: EnvState, action: Tensor) -> None:
+        """Look at the present values of `env` and of the simulator, and at the action A_t (num_envs, num_joints)."""
         self.world, self.env, self.action = world, env, action
         self.state: SimState = world.sim.state
-        self.fallen = torch.zeros_like(env.command_timer, dtype=torch.bool) if fallen is None else fallen
+
+    @cached_property
+    def fallen(self) -> Tensor:
+        """Whether the episode ends here by a termination or a fault, bool, (num_envs,); set before rewards are called."""
+        return torch.zeros_like(self.env.has_begun)
 
     @property
     def command(self) -> Tensor:

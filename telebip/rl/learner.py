@@ -10,7 +10,7 @@ from telebip.errors import UserError
 from telebip.mdp.curriculum import share
 from telebip.rl.distributed import Ranks
 from telebip.rl.networks import actor_cfg, critic_cfg, network_class
-from telebip.rl.ppo import FastPPO, ShuffledStorage
+from telebip.rl.ppo import FusedPPO
 
 ALGORITHM = (
     *("num_learning_epochs", "num_mini_batches", "learning_rate", "schedule", "desired_kl", "gamma", "lam", "clip_param"),
@@ -24,8 +24,7 @@ def make_learner(
     ppo: PpoConfig,
     obs_groups: dict[str, list[str]],
     ranks: Ranks,
-    algorithm: type[PPO] = FastPPO,
-    storage: type[RolloutStorage] = ShuffledStorage,
+    algorithm: type[PPO] = FusedPPO,
 ) -> PPO:
     """Return a learner with new networks, which draw their weights from torch's generator, the same in every process.
 
@@ -35,7 +34,6 @@ def make_learner(
         obs_groups: which groups of observations actor and critic see.
         ranks: the processes that learn together.
         algorithm: what learns.
-        storage: what holds the rollout.
 
     Raises:
         UserError: an iteration has too few samples.
@@ -46,7 +44,7 @@ def make_learner(
     learner = algorithm(
         network(obs, obs_groups, "actor", env.num_actions, **actor_cfg(ppo)),
         network(obs, obs_groups, "critic", 1, **critic_cfg(ppo)),
-        storage("rl", env.num_envs, ppo.num_steps_per_env, obs, [env.num_actions], device),
+        RolloutStorage("rl", env.num_envs, ppo.num_steps_per_env, obs, [env.num_actions], device),
         device=device,
         multi_gpu_cfg=ranks.multi_gpu_cfg,
         **{name: getattr(ppo, name) for name in ALGORITHM},

@@ -12,7 +12,6 @@ from typing import Any
 
 import torch
 from rsl_rl.algorithms import PPO
-from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -25,7 +24,7 @@ from telebip.rl.layout import obs_groups, seen
 from telebip.rl.learner import make_learner, set_min_std
 from telebip.rl.log import EpisodeStatistics, RunLog
 from telebip.rl.networks import arithmetic
-from telebip.rl.ppo import FastPPO, ShuffledStorage
+from telebip.rl.ppo import FusedPPO
 from telebip.rl.process import random_state, set_random_state
 from telebip.rl.resume import load_learner, require_complete, require_same
 from telebip.rl.saving import Saver
@@ -35,8 +34,7 @@ from telebip.rl.symmetry import SymmetricEnv, joint_mirror
 class Trainer:
     """Trains one policy in one run folder."""
 
-    algorithm: type[PPO] = FastPPO
-    storage: type[RolloutStorage] = ShuffledStorage
+    algorithm: type[PPO] = FusedPPO
 
     def __init__(
         self,
@@ -58,7 +56,7 @@ class Trainer:
         ppo = env.cfg.ppo
         self.view = SymmetricEnv(env) if ppo.symmetry == "phase" else env
         torch.manual_seed(env.cfg.seed)
-        self.learner = make_learner(self.view, ppo, obs_groups(env.layout()), self.ranks, self.algorithm, self.storage)
+        self.learner = make_learner(self.view, ppo, obs_groups(env.layout()), self.ranks, self.algorithm)
         self._saver = Saver(self.ranks, env.device, ppo.keep_checkpoints, note)
         self._episodes = EpisodeStatistics(env.num_envs, env.device)
         # Spread the time-outs over the iterations.

@@ -21,9 +21,7 @@ def indexed(device: torch.device) -> torch.device:
 
 def choose_backend(backend: Backend, device: torch.device) -> Backend:
     """Return the backend that `auto` stands for: `warp` on CUDA and `native` on the CPU."""
-    if backend != "auto":
-        return backend
-    return "warp" if device.type == "cuda" else "native"
+    return backend if backend != "auto" else "warp" if device.type == "cuda" else "native"
 
 
 def make_simulator(
@@ -36,10 +34,10 @@ def make_simulator(
     sensors: Sequence[str] = (),
     capacity: tuple[int, int] = (8, 64),
 ) -> Simulator:
-    """Create the backend, see `choose_backend`.
+    """Create the backend.
 
     Args:
-        backend: which.
+        backend: which, see `choose_backend`.
         robot: the model.
         num_envs: number of worlds.
         decimation: physics steps per `Simulator.step`.

@@ -17,6 +17,9 @@ Backend = Literal["auto", "native", "warp"]
 Columns = slice | Tensor
 """Which columns: a slice where they lie side by side, as on most robots, which spares a copy, else their numbers."""
 
+MEANS = ("joint_force", "joint_power", "joint_net_power", "foot_force")
+"""Fields of `SimState` that are means over the physics steps of a policy step."""
+
 ENGINE_FAULTS = ("engine_warning", "engine_error", "capacity")
 """What an engine reports of a world itself: a warning, an error, or more contacts or constraints than there is room for."""
 
@@ -71,8 +74,7 @@ class SimState:
     @property
     def step_values(self) -> dict[str, Tensor]:
         """What only a step fills, and `reset` and `load` leave at zero: means over the policy step, and sensors."""
-        means = ("foot_force", "joint_force", "joint_power", "joint_net_power")
-        return {name: getattr(self, name) for name in means} | {f"sensors.{name}": v for name, v in self.sensors.items()}
+        return {name: getattr(self, name) for name in MEANS} | {f"sensors.{name}": v for name, v in self.sensors.items()}
 
     @staticmethod
     def zeros(robot: Robot, num_envs: int, device: torch.device, sensors: Sequence[str] = ()) -> "SimState":

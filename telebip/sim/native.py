@@ -31,16 +31,7 @@ class NativeSimulator:
         sensors: Sequence[str] = (),
         num_threads: int = 0,
     ) -> None:
-        """Create the worlds in the home pose.
-
-        Args:
-            robot: the model.
-            num_envs: number of worlds.
-            decimation: physics steps per `step`.
-            model_fields: names of `mujoco.MjModel` fields that get one value per world.
-            sensors: names of the sensors to keep in `state`.
-            num_threads: physics threads; 0 is one per processor.
-        """
+        """Create the worlds in the home pose, as `telebip.sim.make_simulator` does; 0 `num_threads` are one per processor."""
         self.num_envs = num_envs
         self.device = torch.device("cpu")
         self.model = robot.engine_model(sensors)

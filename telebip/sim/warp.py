@@ -5,6 +5,7 @@ The only file that imports `mujoco_warp`. Torch tensors and Warp arrays share me
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import mujoco_warp as mjw
 import torch
@@ -13,13 +14,10 @@ from torch import Tensor
 
 from telebip.errors import UserError
 from telebip.robot import FOOT_SENSORS, TRUNK, Robot
-from telebip.sim.base import ENGINE_FAULTS, Backend, SimState, columns_on, derives, state_fields
+from telebip.sim.base import ENGINE_FAULTS, MEANS, Backend, SimState, derives, state_fields
 
 CAPACITY = int(mjw.OverflowType.ALL & ~(mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS))
 """Overflows that truncate the physics; the MJCF's limits on solver iterations are meant."""
-
-MEANS = ("joint_force", "joint_power", "joint_net_power", "foot_force")
-"""Fields of `SimState` that `_accumulate` fills, in its order."""
 
 DERIVED = (
     *("body_subtreemass", "body_invweight0", "dof_invweight0", "tendon_invweight0", "tendon_length0", "actuator_acc0"),
@@ -41,7 +39,7 @@ def _accumulate(
     joint_net_power: wp.array2d[float],
     foot_force: wp.array2d[float],
 ):
-    """Add one physics step's share, `scale` = 1 / decimation, to the means over a policy step."""
+    """Add one physics step's share, `scale` = 1 / decimation, to the means over a policy step; the last four are `MEANS`."""
     world, i = wp.tid()  # type: ignore[misc]
     force = actuator_force[world, i]
     joint_force[world, i] += scale * force
@@ -69,17 +67,9 @@ class WarpSimulator:
         max_contacts: int = 8,
         max_constraints: int = 64,
     ) -> None:
-        """Create the worlds in the home pose; the first use on a machine compiles kernels for a minute or more.
+        """Create the worlds in the home pose, as `telebip.sim.make_simulator` does, with room for so much in each of them.
 
-        Args:
-            robot: the model.
-            num_envs: number of worlds.
-            decimation: physics steps per `step`.
-            device: where to simulate.
-            model_fields: names of model fields that get one value per world.
-            sensors: names of the sensors to keep in `state`.
-            max_contacts: room for contacts, per world.
-            max_constraints: room for rows of the constraint solver, per world.
+        The first use on a machine compiles kernels for a minute or more.
 
         Raises:
             UserError: the engine lacks something of the robot, or has one value of a field for all worlds.
@@ -109,7 +99,15 @@ class WarpSimulator:
         self._live = [getattr(data, name) for name in self.memory]
         self._copies = [wp.clone(array) for array in self._live]
         self.memory_before = {name: wp.to_torch(copy) for name, copy in zip(self.memory, self._copies, strict=True)}
-        self.state = self._make_state(robot, sensors)
+        sensordata, places = wp.to_torch(data.sensordata), {name: self.model.sensor(name) for name in sensors}
+        blank = SimState.zeros(robot, num_envs, device)
+        self.state = replace(  # positions, velocities and sensors are the engine's own buffers
+            blank,
+            **{name: getattr(blank, name).contiguous() for name in MEANS},  # row by row, as the kernel's threads go
+            qpos=self.memory["qpos"],
+            qvel=self.memory["qvel"],
+            sensors={name: sensordata[:, place.adr[0] : place.adr[0] + place.dim[0]] for name, place in places.items()},
+        )
         self._means = [wp.from_torch(getattr(self.state, name)) for name in MEANS]
         self._ctrl, self._overflow = wp.to_torch(data.ctrl), wp.to_torch(data.overflow)
         self._targets = [wp.to_torch(controls) for controls in self._schedule]
@@ -161,27 +159,14 @@ class WarpSimulator:
         if self._derives:
             self._do(self._set_const)
 
-    def _make_state(self, robot: Robot, sensors: Sequence[str]) -> SimState:
-        """Return the state: positions, velocities and sensors are the engine's own buffers."""
-        data, places = wp.to_torch(self.mjw_data.sensordata), {name: self.model.sensor(name) for name in sensors}
-        sizes = {name: len(FOOT_SENSORS) if name == "foot_force" else self.model.nu for name in MEANS}
-        return SimState(
-            qpos=self.memory["qpos"],
-            qvel=self.memory["qvel"],
-            **{name: torch.zeros(self.num_envs, size, device=self.device) for name, size in sizes.items()},
-            sensors={name: data[:, place.adr[0] : place.adr[0] + place.dim[0]] for name, place in places.items()},
-            joint_columns=columns_on(self.device, robot),
-        )
-
     def _hold(self) -> None:
-        """Do the physics steps of one policy step with the present controls, and fill `memory_before` and the means."""
         self._advance([])
 
     def _follow(self) -> None:
-        """Do the same with the controls of each physics step."""
         self._advance(self._schedule)
 
     def _advance(self, schedule: list[wp.array]) -> None:
+        """Do one policy step, with the present controls or those of each physics step; fill `memory_before` and the means."""
         data = self.mjw_data
         for copy, live in zip(self._copies, self._live, strict=True):
             wp.copy(copy, live)

@@ -19,8 +19,8 @@ def walk_layout(robots: Sequence[str], plots: Mapping[str, Plot]) -> rrb.Bluepri
     """Lay out a recording of walks.
 
     Args:
-        robots: their entities' names below `world` and `plot`, from left to right; the camera follows the middle one.
-        plots: what there is to see of each, by its entity's name below `plot/<robot>`.
+        robots: entities' names below `world` and `plot`, from left to right; the camera follows the middle one.
+        plots: what there is to see of each, by the name below `plot/<robot>`.
     """
 
     def view(name: str, shown: Sequence[str]) -> rrb.TimeSeriesView:
@@ -51,12 +51,8 @@ def walk_layout(robots: Sequence[str], plots: Mapping[str, Plot]) -> rrb.Bluepri
     )
 
 
-def training_layout(curves: dict[str, Sequence[str]]) -> rrb.Blueprint:
-    """Lay out the live view of a training.
-
-    Args:
-        curves: entities of the learning curves for each plot, by its title.
-    """
+def training_layout(curves: Mapping[str, Sequence[str]]) -> rrb.Blueprint:
+    """Lay out the live view of a training: `curves` are the entities of each plot, by its title."""
     everything = (rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.infinite())
     charts = [
         rrb.TimeSeriesView(
@@ -77,12 +73,7 @@ def training_layout(curves: dict[str, Sequence[str]]) -> rrb.Blueprint:
 
 
 def robots_view(followed: str | None, robots: int) -> rrb.Spatial3DView:
-    """Show everything below `world` on a floor grid of half metres, from the right and the front.
-
-    Args:
-        followed: entity that the camera follows, if any.
-        robots: how many have to fit into the picture.
-    """
+    """Show `robots` below `world` on a floor grid of half metres, from the right and the front; follow an entity, if any."""
     away = 1.0 + 0.35 * (robots - 1)
     ahead = 0.0 if followed else 1.2  # m: where robots that the camera does not follow are halfway
     return rrb.Spatial3DView(

@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
@@ -15,11 +15,10 @@ from telebip.eval.plots import COLORS, STYLE
 from telebip.robot import Robot
 from telebip.viz.render import Array, Renderer
 from telebip.viz.scene import Actor
-from telebip.viz.series import plots
+from telebip.viz.series import plots, split_side
 
 INK = (35, 40, 50)
 AXIS_COLORS = {"hip_roll": (200, 50, 60), "hip_pitch": (30, 140, 80), "knee": (40, 90, 210)}
-ARROW_LENGTH = {"hip_roll": 0.16, "hip_pitch": 0.13, "knee": 0.16}  # m
 LEARNING = {
     "episode_length": "episode length [policy steps]",
     "velocity_error_mps": "velocity error [m/s]",
@@ -50,7 +49,7 @@ def draw_robot(robot: Robot, size: tuple[int, int] = (1000, 720)) -> Image.Image
         draw.text((x, y), text, fill=INK, font=font, anchor="mm")
     rows = {"hip_pitch": 0.26, "hip_roll": 0.42, "knee": 0.66}
     for i, joint in enumerate(robot.joint_names):
-        side, _, kind = joint.partition("_")
+        side, kind = split_side(joint)
         (low, high), limit = robot.joint_range[i], robot.force_limit[i]
         units = ("m", "N") if robot.is_slide[i] else ("rad", "N m")
         x, y = picture.width * (0.03 if side == "right" else 0.97), picture.height * rows[kind]
@@ -64,24 +63,22 @@ def draw_robot(robot: Robot, size: tuple[int, int] = (1000, 720)) -> Image.Image
 
 def _draw_axis(renderer: Renderer, joint: str) -> Array:
     """Add an arrow along a joint's axis, outwards from the robot, beside the leg for a knee; return its tip [m]."""
-    side, _, kind = joint.partition("_")
+    side, kind = split_side(joint)
     outwards = 1.0 if side == "left" else -1.0
-    axis = renderer.data.joint(joint).xaxis.copy()
-    if kind == "hip_pitch":
-        axis *= outwards
+    axis = renderer.data.joint(joint).xaxis * (outwards if kind == "hip_pitch" else 1.0)
     start = renderer.data.joint(joint).xanchor + 0.05 * axis
     if kind == "knee":
         start += [0.0, 0.06 * outwards, 0.18]
-    tip = start + ARROW_LENGTH[kind] * axis
+    tip = start + (0.13 if kind == "hip_pitch" else 0.16) * axis
     renderer.arrow(start, tip, AXIS_COLORS[kind], radius=0.007)
     return tip
 
 
 def draw_control_loop(config: TaskConfig, robot: Robot, observation: Mapping[str, int]) -> Figure:
     """Draw what happens in one policy step, with the rates of the task and the size of each term of its `observation`."""
-    policy_hz = 1.0 / (config.sim.decimation * robot.physics_dt)
-    physics_hz = 1.0 / robot.physics_dt
-    figure, axes = plt.subplots(figsize=(9.6, 3.7))
+    physics_hz, decimation = 1.0 / robot.physics_dt, config.sim.decimation
+    figure = Figure((9.6, 3.7))
+    axes = figure.subplots()
     axes.set(xlim=(0, 96), ylim=(0, 37))
     axes.axis("off")
 
@@ -98,8 +95,8 @@ def draw_control_loop(config: TaskConfig, robot: Robot, observation: Mapping[str
 
     box(0, 2, 96, 34, "", "#f3f4f6")
     box(56, 10, 38.5, 21, "", "#dfe6ee")
-    axes.text(2, 33.5, f"policy step: {policy_hz:.0f} Hz", fontsize=10, fontweight="bold", va="center")
-    title = f"physics: {physics_hz:.0f} Hz, {config.sim.decimation} steps of {1e3 * robot.physics_dt:g} ms"
+    axes.text(2, 33.5, f"policy step: {physics_hz / decimation:.0f} Hz", fontsize=10, fontweight="bold", va="center")
+    title = f"physics: {physics_hz:.0f} Hz, {decimation} steps of {1e3 * robot.physics_dt:g} ms"
     axes.text(57.5, 28.5, title, fontsize=10, fontweight="bold", va="center")
     sizes = [f"{name.replace('_', ' ')} {size}" for name, size in observation.items()]
     lines = [", ".join(sizes[i : i + 2]) for i in range(0, len(sizes), 2)]
@@ -113,26 +110,26 @@ def draw_control_loop(config: TaskConfig, robot: Robot, observation: Mapping[str
     arrow([(75, 21), (81.5, 21)], "forces", (78.2, 22.7))
     arrow([(81.5, 17), (75, 17)], "q, $\\dot{q}$", (78.2, 15.3))
     arrow([(87, 12.5), (87, 6), (16, 6), (16, 12.5)], "state; means of forces and power over the step", (51, 7.7))
+    arrow([(16, 31), (16, 26)], "command vx, vy, yaw rate; phase p_r, p_l", (33, 29.3))
     rewards = f"rewards in training: {', '.join(config.rewards)}"
     axes.text(51, 4.1, rewards, ha="center", va="center", fontsize=8.5, color="#3b414c")
-    arrow([(16, 31), (16, 26)], "command vx, vy, yaw rate; phase p_r, p_l", (33, 29.3))
     return figure
 
 
+@rc_context(STYLE)
 def draw_stride(actor: Actor, robot: Robot, seconds: float = 1.5) -> Figure:
     """Plot the last `seconds` of a walk of telebip's robot: speed, feet, knees, hips, power."""
     rollout = actor.rollout
     rows = slice(-round(seconds / rollout.step_dt), None)
     time = rollout.time[rows] - rollout.time[rows][0]
     shown = plots(rollout, actor.world, robot.is_slide)
-    with plt.rc_context(STYLE):
-        names = ("speed", "gait", "hip_pitch", "knee", "power", "reward")
-        figure, grid = plt.subplots(3, 2, figsize=(9.6, 6.0), sharex=True, layout="constrained")
-        for axes, name in zip(grid.flat, names, strict=True):
-            _plot_curves(axes, time, {key: curve.values[rows] for key, curve in shown[name].curves.items()})
-            axes.set_title(shown[name].title)
-        for axes in grid[-1]:
-            axes.set_xlabel("time [s]")
+    figure = Figure((9.6, 6.0), layout="constrained")
+    grid = figure.subplots(3, 2, sharex=True)
+    for axes, name in zip(grid.flat, ("speed", "gait", "hip_pitch", "knee", "power", "reward"), strict=True):
+        _plot_curves(axes, time, {key: curve.values[rows] for key, curve in shown[name].curves.items()})
+        axes.set_title(shown[name].title)
+    for axes in grid[-1]:
+        axes.set_xlabel("time [s]")
     return figure
 
 
@@ -149,17 +146,18 @@ def _plot_curves(axes: Axes, time: Array, curves: dict[str, Array]) -> None:
     axes.set_xlim(time[0], time[-1])
 
 
+@rc_context(STYLE)
 def draw_learning(curves: dict[str, Any], label: str) -> Figure:
     """Plot learning curves as `telebip.eval.learning.learning_curve` returns them."""
     samples = np.array(curves["samples"]) / 1e6
-    with plt.rc_context(STYLE):
-        figure, grid = plt.subplots(2, 2, figsize=(9.6, 4.6), sharex=True, layout="constrained")
-        for i, (axes, (name, title)) in enumerate(zip(grid.flat, LEARNING.items(), strict=True)):
-            values = np.array(curves[name], dtype=float)
-            axes.plot(samples, values, color=COLORS[i], lw=1.6)
-            late = values[len(values) // 20 :]  # the first stumbles would set the scale
-            axes.set(title=title, ylim=(0, 1.15 * np.nanmax(late)), xlim=(0, samples[-1]))
-        for axes in grid[-1]:
-            axes.set_xlabel("million samples")
-        figure.suptitle(f"training of {label}", fontsize=10, color="#555b66")
+    figure = Figure((9.6, 4.6), layout="constrained")
+    grid = figure.subplots(2, 2, sharex=True)
+    for axes, tone, (name, title) in zip(grid.flat, COLORS[:4], LEARNING.items(), strict=True):
+        values = np.array(curves[name], dtype=float)
+        axes.plot(samples, values, color=tone, lw=1.6)
+        late = values[len(values) // 20 :]  # the first stumbles would set the scale
+        axes.set(title=title, ylim=(0, 1.15 * np.nanmax(late)), xlim=(0, samples[-1]))
+    for axes in grid[-1]:
+        axes.set_xlabel("million samples")
+    figure.suptitle(f"training of {label}", fontsize=10, color="#555b66")
     return figure

@@ -25,19 +25,19 @@ FRAME_STEPS = 4  # policy steps from one frame to the next
 BUDGET = 0.03  # share of the training's time that all this may take
 
 CHARTS = {
-    "episode length [policy steps]": ("train/episode_length",),
-    "return": ("train/episode_return",),
-    "velocity and yaw-rate error [m/s, rad/s]": ("error/lin_vel_mps", "error/yaw_rate_radps"),
-    "cost of transport": ("walk/cost_of_transport",),
-    "rewards per step": (),  # all of them
-    "samples per second": ("speed/samples_per_s",),
+    "episode length [policy steps]": ["/training/train/episode_length"],
+    "return": ["/training/train/episode_return"],
+    "velocity and yaw-rate error [m/s, rad/s]": ["/training/error/lin_vel_mps", "/training/error/yaw_rate_radps"],
+    "cost of transport": ["/training/walk/cost_of_transport"],
+    "rewards per step": ["/training/reward/**"],
+    "samples per second": ["/training/speed/samples_per_s"],
 }
 
 
 @contextmanager
 def live_view(trainer: Trainer, address: str | None) -> Iterator[Callable[[dict[str, float]], None]]:
     """Open a rerun viewer (see `telebip.viz.rerun.viewer`) and yield the function that an iteration's scalars go to."""
-    with viewer(training_layout({title: _entities(names) for title, names in CHARTS.items()}), address) as stream:
+    with viewer(training_layout(CHARTS), address) as stream:
         view = LiveView(trainer, stream)
         try:
             yield view.update
@@ -48,8 +48,8 @@ def live_view(trainer: Trainer, address: str | None) -> Iterator[Callable[[dict[
 class LiveView:
     """Streams curves after every iteration, and now and then a new walk, which a thread of its own plays over and over.
 
-    The robots live in worlds of their own, with the task's commands and disturbances: the training does not notice them. They
-    walk on the CPU, anew whenever curves, walks and frames so far have taken less than their share of the time.
+    The robots live in worlds of their own on the CPU, with the task's commands and disturbances, and walk anew whenever curves,
+    walks and frames so far have taken less than their share of the time.
     """
 
     def __init__(self, trainer: Trainer, stream: rr.RecordingStream, budget: float = BUDGET) -> None:
@@ -113,10 +113,6 @@ class LiveView:
         """Set the calling thread's time: samples, which the viewer follows, and seconds, which can be played again."""
         self._stream.set_time("samples", sequence=self._trainer.samples)
         self._stream.set_time("time", duration=time.perf_counter() - self._start)
-
-
-def _entities(names: tuple[str, ...]) -> list[str]:
-    return [f"/training/{name}" for name in names] or ["/training/reward/**"]
 
 
 def _poses(pose: Array) -> list[rr.DescribedComponentBatch]:

@@ -7,13 +7,9 @@ import sys
 from telebip.errors import UserError, nearest
 
 PACKAGES = {"egl": ("libEGL.so.1", "libegl1"), "osmesa": ("libOSMesa.so.8", "libosmesa6")}
-"""Library of each way to render without a display, and the Debian package that holds it."""
-
-NAMES = ("egl", "osmesa", "glfw", "glx", "disable")
-"""What to choose from in `MUJOCO_GL`."""
-
-MORE_NAMES = ("wgl", "cgl", "disabled", "off", "false", "0", "enable", "enabled", "on", "true", "1")
-"""What MuJoCo takes besides, somewhere."""
+"""Library of each way to render without a display, and its Debian package."""
+NAMES = ("egl", "osmesa", "glfw", "glx", "disable")  # what to choose from in `MUJOCO_GL`
+MORE_NAMES = ("wgl", "cgl", "disabled", "off", "false", "0", "enable", "enabled", "on", "true", "1")  # taken too, somewhere
 
 
 def has_display() -> bool:

@@ -12,12 +12,7 @@ from telebip.viz.scene import Actor
 
 
 def strobe(
-    actor: Actor,
-    robot: Robot,
-    file: Path,
-    interval: float = 0.55,
-    poses: int = 6,
-    size: tuple[int, int] = (1600, 560),
+    actor: Actor, robot: Robot, file: Path, interval: float = 0.55, poses: int = 6, size: tuple[int, int] = (1600, 560)
 ) -> None:
     """Render the last `poses` poses of a walk, `interval` apart, side by side as they stood on the ground.
 

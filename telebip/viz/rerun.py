@@ -11,16 +11,18 @@ from urllib.parse import urlsplit
 import mujoco
 import numpy as np
 import rerun as rr
+import torch
 import yourdfpy
 from rerun.blueprint import Blueprint
 
 from telebip.errors import UserError
+from telebip.math import yaw
 from telebip.robot import FEET, FOOT_SENSORS, TRUNK, Robot
 from telebip.viz.blueprint import walk_layout
 from telebip.viz.opengl import has_display
 from telebip.viz.scene import ACTUAL, COMMAND, FORCE_SCALE, GROUND_FORCE, PUSH, PUSH_SCALE, SPEED_SCALE, Actor, Color
 from telebip.viz.series import PALETTE, SHARED, TOTAL, Plot, plots
-from telebip.viz.urdf import Array, joint_transforms, link_mesh, link_paths, load_urdf, rotation_matrices
+from telebip.viz.urdf import Array, joint_transforms, link_mesh, link_paths, load_urdf
 
 
 def record(actors: Sequence[Actor], robot: Robot, file: Path) -> None:
@@ -60,10 +62,10 @@ def show(actors: Sequence[Actor], robot: Robot, address: str | None = None) -> N
 @contextmanager
 def viewer(layout: Blueprint, address: str | None) -> Iterator[rr.RecordingStream]:
     """Yield a stream into a rerun viewer, and wait at the end until everything has arrived; see `show`."""
-    require_viewer(address)
+    url = require_viewer(address)
     stream = rr.RecordingStream("telebip")
-    if address:
-        stream.connect_grpc(_url(address), default_blueprint=layout)
+    if url:
+        stream.connect_grpc(url, default_blueprint=layout)
     else:
         stream.spawn(default_blueprint=layout)
     try:
@@ -72,8 +74,8 @@ def viewer(layout: Blueprint, address: str | None) -> Iterator[rr.RecordingStrea
         stream.disconnect()
 
 
-def require_viewer(address: str | None) -> None:
-    """Make sure that `show` and `viewer` have somewhere to send to.
+def require_viewer(address: str | None) -> str | None:
+    """Make sure that `show` and `viewer` have somewhere to send to; return its URL if it is not to be started here.
 
     Raises:
         UserError: no viewer answers at `address`, or without one, there is no display to start a viewer on.
@@ -83,9 +85,10 @@ def require_viewer(address: str | None) -> None:
             raise UserError(
                 "a rerun viewer needs a display; use --connect HOST:PORT with a viewer elsewhere, or play.py --record FILE.rrd"
             )
-        return
+        return None
+    url = address if "://" in address else f"rerun+http://{address}/proxy"
     try:
-        place = urlsplit(_url(address))
+        place = urlsplit(url)
         host, port = place.hostname or "", place.port or 9876
     except ValueError as error:
         raise UserError(f"'{address}' is no address of a rerun viewer: {error}") from error
@@ -93,22 +96,21 @@ def require_viewer(address: str | None) -> None:
         socket.create_connection((host, port), timeout=3.0).close()  # rerun itself would retry for ever
     except OSError as error:
         raise UserError(f"no rerun viewer answers at '{address}': {error.strerror or error}") from error
-
-
-def _url(address: str) -> str:
-    return address if "://" in address else f"rerun+http://{address}/proxy"
+    return url
 
 
 def log_walks(stream: rr.RecordingStream, actors: Sequence[Actor], robot: Robot, urdf: yourdfpy.URDF) -> None:
     """Log robots below `world/<name>`, and their series below `plot/<name>`."""
     stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    several = len(actors) > 1
     for i, (name, actor) in enumerate(zip(names(actors), actors, strict=True)):
         time = rr.TimeColumn("time", duration=actor.rollout.time)
-        _log_shape(stream, urdf, f"world/{name}", actor, several)
-        _log_motion(stream, urdf, robot, f"world/{name}", actor, time)
+        stream.log(f"world/{name}", rr.Transform3D(translation=[0.0, actor.lane, 0.0]), static=True)
+        if len(actors) > 1:
+            above = rr.Points3D([[0.0, 0.0, 0.4]], radii=0.005, colors=[250, 250, 250], labels=[actor.label], show_labels=True)
+            stream.log(f"world/{name}/{TRUNK}/label", above, static=True)
+        _log_links(stream, urdf, robot, f"world/{name}", actor, time)
         _log_arrows(stream, robot, f"world/{name}", actor, time)
-        own = PALETTE[i % len(PALETTE)] if several else None
+        own = PALETTE[i % len(PALETTE)] if len(actors) > 1 else None
         _log_series(stream, plots(actor.rollout, actor.world, robot.is_slide), f"plot/{name}", actor.label, time, own)
 
 
@@ -128,28 +130,20 @@ def log_mesh(stream: rr.RecordingStream, path: str, urdf: yourdfpy.URDF, link: s
         shape = rr.Mesh3D(
             vertex_positions=mesh.vertices,
             triangle_indices=mesh.faces,
-            vertex_normals=mesh.normals,
-            vertex_colors=mesh.colors,
+            vertex_normals=mesh.vertex_normals,
+            vertex_colors=mesh.visual.vertex_colors,
         )
         stream.log(path, shape, static=True)
 
 
-def _log_shape(stream: rr.RecordingStream, urdf: yourdfpy.URDF, root: str, actor: Actor, several: bool) -> None:
-    stream.log(root, rr.Transform3D(translation=[0.0, actor.lane, 0.0]), static=True)
-    for link, path in link_paths(urdf).items():
-        log_mesh(stream, f"{root}/{path}", urdf, link)
-    if several:
-        label = rr.Points3D([[0.0, 0.0, 0.4]], radii=0.005, colors=[250, 250, 250], labels=[actor.label], show_labels=True)
-        stream.log(f"{root}/{TRUNK}/label", label, static=True)
-
-
-def _log_motion(
+def _log_links(
     stream: rr.RecordingStream, urdf: yourdfpy.URDF, robot: Robot, root: str, actor: Actor, time: rr.TimeColumn
 ) -> None:
-    """Log the trunk's pose in the lane, and every link's in its parent's."""
+    """Log the links' shapes, the trunk's pose in the lane, and every other link's in its parent's."""
     qpos, paths = actor.rollout.qpos[:, actor.world], link_paths(urdf)
-    quat_xyzw = np.roll(qpos[:, 3:7], -1, axis=1)
-    trunk = rr.Transform3D.columns(translation=qpos[:, :3], quaternion=quat_xyzw)
+    for link, path in paths.items():
+        log_mesh(stream, f"{root}/{path}", urdf, link)
+    trunk = rr.Transform3D.columns(translation=qpos[:, :3], quaternion=np.roll(qpos[:, 3:7], -1, axis=1))
     stream.send_columns(f"{root}/{TRUNK}", indexes=[time], columns=trunk)
     for link, pose in joint_transforms(urdf, robot, qpos).items():
         columns = rr.Transform3D.columns(translation=pose[:, :3, 3], mat3x3=pose[:, :3, :3])
@@ -164,20 +158,15 @@ def _log_arrows(stream: rr.RecordingStream, robot: Robot, root: str, actor: Acto
 
     def arrows(path: str, origins: Array, vectors: Array, color: Color, radius: float = 0.012) -> None:
         stream.log(f"{root}/{path}", rr.Arrows3D.from_fields(colors=[color], radii=[radius]), static=True)
-        columns = rr.Arrows3D.columns(origins=origins, vectors=vectors)
-        stream.send_columns(f"{root}/{path}", indexes=[time], columns=columns)
+        stream.send_columns(f"{root}/{path}", indexes=[time], columns=rr.Arrows3D.columns(origins=origins, vectors=vectors))
 
     feet = _foot_positions(robot, qpos)
     for i, foot in enumerate(FEET):
         force = FORCE_SCALE * rollout.foot_force[:, world, i, None] * up
         arrows(f"ground_force/{foot}", feet[:, i], force, GROUND_FORCE, radius=0.022)  # thicker than the shank
     arrows("push", trunk + 0.1 * up, PUSH_SCALE * rollout.push_w[:, world], PUSH)
-    forward = rotation_matrices(qpos[:, 3:7])[:, :2, 0]
-    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
-    command = rollout.command[:, world]
-    wanted = np.zeros((len(qpos), 3))
-    wanted[:, 0] = command[:, 0] * forward[:, 0] - command[:, 1] * forward[:, 1]
-    wanted[:, 1] = command[:, 0] * forward[:, 1] + command[:, 1] * forward[:, 0]
+    psi, (vx, vy, _) = yaw(torch.as_tensor(qpos[:, 3:7])).numpy(), rollout.command[:, world].T
+    wanted = np.stack([np.cos(psi) * vx - np.sin(psi) * vy, np.sin(psi) * vx + np.cos(psi) * vy, 0.0 * vx], axis=-1)
     actual = rollout.qvel[:, world, :3] * [1.0, 1.0, 0.0]
     arrows("velocity/command", trunk + 0.30 * up, SPEED_SCALE * wanted, COMMAND)
     arrows("velocity/actual", trunk + 0.27 * up, SPEED_SCALE * actual, ACTUAL)

@@ -1,7 +1,7 @@
 """Who is seen: robots side by side, from any number of rollouts; and how long and in which colour arrows are drawn."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from telebip.rollout import Rollout
 
@@ -23,19 +23,9 @@ class Actor:
 
 
 def line_up(rollouts: Sequence[tuple[str, Rollout]], worlds: int = 1) -> list[Actor]:
-    """Place the first `worlds` worlds of every labelled rollout side by side, from left to right, centred.
-
-    Args:
-        rollouts: what happened, each with the name it is shown under: policies that walked the same command, say.
-        worlds: how many of each at most.
-    """
-    places = [(label, rollout, i) for label, rollout in rollouts for i in range(min(worlds, rollout.qpos.shape[1]))]
-    return [
-        Actor(
-            label=label if min(worlds, rollout.qpos.shape[1]) == 1 else f"{label} {world + 1}",
-            rollout=rollout,
-            world=world,
-            lane=LANE * (0.5 * (len(places) - 1) - i),
-        )
-        for i, (label, rollout, world) in enumerate(places)
-    ]
+    """Place the first `worlds` worlds (at most) of every labelled rollout side by side, from left to right, centred."""
+    actors = []
+    for label, rollout in rollouts:
+        count = min(worlds, rollout.qpos.shape[1])
+        actors += [Actor(label if count == 1 else f"{label} {world + 1}", rollout, world) for world in range(count)]
+    return [replace(actor, lane=LANE * (0.5 * (len(actors) - 1) - i)) for i, actor in enumerate(actors)]

@@ -47,18 +47,12 @@ class Plot:
 
 
 def plots(rollout: Rollout, world: int, is_slide: NDArray[np.bool_]) -> dict[str, Plot]:
-    """Return the plots of one world, by the names under which a recording keeps them.
+    """Return the plots of one world, by the names under which a recording keeps them; `is_slide` as in `Robot`.
 
     Joints share a plot with those of the other side: `right_knee` and `left_knee` are curves of `knee`.
-
-    Args:
-        rollout: what happened.
-        world: index of the world.
-        is_slide: `Robot.is_slide`.
     """
     velocity = heading_velocity(rollout.qpos[:, world], rollout.qvel[:, world])
     command, power = rollout.command[:, world], rollout.joint_power[:, world].sum(-1)
-    yaw_rate = rollout.qvel[:, world, 5]
     phase, load = rollout.phase[:, world], rollout.foot_force[:, world] / rollout.weight
     running = running_cost_of_transport(power, velocity, rollout.weight, round(1.0 / rollout.step_dt))
 
@@ -73,7 +67,7 @@ def plots(rollout: Rollout, world: int, is_slide: NDArray[np.bool_]) -> dict[str
     return {
         "speed": Plot("motion", "speed [m/s]", against(command[:, 0], "forward", velocity[:, 0])),
         "side_speed": Plot("motion", "speed to the left [m/s]", against(command[:, 1], "left", velocity[:, 1])),
-        "yaw_rate": Plot("motion", "yaw rate [rad/s]", against(command[:, 2], "trunk", yaw_rate)),
+        "yaw_rate": Plot("motion", "yaw rate [rad/s]", against(command[:, 2], "trunk", rollout.qvel[:, world, 5])),
         "cost_of_transport": Plot("cost", "cost of transport, last second", {"mechanical": Curve(running, TOTAL)}),
         "gait": Plot("gait", "phase, foot force / weight", pair(phase, ("p_r", "p_l"), 0.7) | pair(load, FEET)),
         **_joint_plots(rollout, world, is_slide),
@@ -112,7 +106,7 @@ def split_side(joint: str) -> tuple[str, str]:
     return (side, kind) if side in ("right", "left") and kind else ("", joint)
 
 
-def running_cost_of_transport(power: Array, velocity: Array, weight: float, window: int, slowest: float = 0.05) -> Array:
+def running_cost_of_transport(power: Array, velocity: Array, weight: float, window: int) -> Array:
     r"""Cost of transport of the latest rows, COT_t = mean P / (m g ||mean v||) over the last `window` rows.
 
     Args:
@@ -120,13 +114,12 @@ def running_cost_of_transport(power: Array, velocity: Array, weight: float, wind
         velocity: horizontal velocity [m/s], (steps, 2).
         weight: m g [N].
         window: number of rows.
-        slowest: below this mean speed the quotient says nothing [m/s].
 
     Returns:
-        Cost of transport [-], (steps,); NaN below `slowest`, and until the first window is full: the robot gathers speed.
+        Cost of transport [-], (steps,); NaN below 0.05 m/s, and until the first window is full.
     """
     speed = np.linalg.norm(running_mean(velocity, window), axis=-1)
-    moving = (speed >= slowest) & (np.arange(len(speed)) >= window - 1)
+    moving = (speed >= 0.05) & (np.arange(len(speed)) >= window - 1)
     return np.where(moving, running_mean(power, window) / (weight * np.where(moving, speed, 1.0)), np.nan)
 
 

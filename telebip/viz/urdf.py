@@ -1,27 +1,19 @@
 """The robot as its URDF draws it, read through yourdfpy: one coloured mesh per link, and where the links are."""
 
-from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
+import torch
 import trimesh
 import yourdfpy
 from numpy.typing import NDArray
 
 from telebip.errors import UserError, nearest
+from telebip.math import matrix
 from telebip.robot import TRUNK, Robot
 
 Array = NDArray[np.floating]
 GREY = (0.7, 0.7, 0.7, 1.0)
-
-
-@dataclass(frozen=True)
-class Mesh:
-    """Triangles with sharp edges, in the frame of a link."""
-
-    vertices: Array  # (n, 3) [m]
-    faces: NDArray[np.integer]  # (m, 3)
-    normals: Array  # (n, 3)
-    colors: NDArray[np.uint8]  # (n, 4), RGBA
 
 
 def load_urdf(robot: Robot) -> yourdfpy.URDF:
@@ -37,8 +29,7 @@ def load_urdf(robot: Robot) -> yourdfpy.URDF:
         urdf = yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False)
     except Exception as error:  # yourdfpy lets through whatever the XML parser and its own converters raise
         raise UserError(f"'{path}' is not a valid URDF: {error}") from error
-    joints = (("joint", name, urdf.joint_map) for name in robot.joint_names)
-    for kind, name, known in (("link", TRUNK, urdf.link_map), *joints):
+    for kind, name, known in (("link", TRUNK, urdf.link_map), *(("joint", name, urdf.joint_map) for name in robot.joint_names)):
         if name not in known:
             raise UserError(f"{path}: no {kind} named '{name}'; {nearest(name, known)}")
     return urdf
@@ -54,45 +45,30 @@ def link_paths(urdf: yourdfpy.URDF) -> dict[str, str]:
     return {link.name: path(link.name) for link in urdf.robot.links}
 
 
-def link_mesh(urdf: yourdfpy.URDF, link: str) -> Mesh | None:
-    """Return all visuals of a link as one mesh, or None if it has none.
+def link_mesh(urdf: yourdfpy.URDF, link: str) -> trimesh.Trimesh | None:
+    """Return all visuals of a link as one mesh in its frame, with colours at the vertices, or None if it has none.
 
     Raises:
         UserError: a shape is none of box, cylinder and sphere.
     """
     palette = {material.name: material.color.rgba for material in urdf.robot.materials if material.color is not None}
-    meshes, colors = [], []
+    meshes = []
     for visual in urdf.link_map[link].visuals:
         mesh = _shape(visual.geometry)
         if visual.origin is not None:
             mesh.apply_transform(visual.origin)
         color = palette.get(visual.material.name, GREY) if visual.material else GREY
+        mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=np.round(255 * np.asarray(color)).astype(np.uint8))
         meshes.append(mesh)
-        colors.append(np.tile(np.round(255 * np.asarray(color)).astype(np.uint8), (len(mesh.vertices), 1)))
-    if not meshes:
-        return None
-    offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
-    return Mesh(
-        vertices=np.concatenate([mesh.vertices for mesh in meshes]),
-        faces=np.concatenate([mesh.faces + offset for mesh, offset in zip(meshes, offsets, strict=True)]),
-        normals=np.concatenate([mesh.vertex_normals for mesh in meshes]),
-        colors=np.concatenate(colors),
-    )
+    return trimesh.util.concatenate(meshes) if meshes else None
 
 
 def joint_transforms(urdf: yourdfpy.URDF, robot: Robot, qpos: Array) -> dict[str, Array]:
     r"""Return the pose of every link in its parent's frame, T = T_origin(joint) M(q), by the child's name.
 
     M(q) slides by q along the axis of a prismatic joint and turns by q about the axis u of a revolute one (Rodrigues):
-    R = 1 + sin(q) [u]x + (1 - cos(q)) [u]x^2. Joints that only the URDF has stay at zero.
-
-    Args:
-        urdf: from `load_urdf`.
-        robot: what the columns of `qpos` are.
-        qpos: positions, (steps, nq).
-
-    Returns:
-        Homogeneous matrices, (steps, 4, 4) each.
+    R = 1 + sin(q) [u]x + (1 - cos(q)) [u]x^2. Joints that only the URDF has stay at zero. From `qpos` (steps, nq) of `robot`;
+    homogeneous matrices, (steps, 4, 4) each.
     """
     columns = {robot.model.joint(i).name: int(robot.model.jnt_qposadr[i]) for i in range(1, robot.model.njnt)}
     transforms = {}
@@ -114,37 +90,20 @@ def joint_transforms(urdf: yourdfpy.URDF, robot: Robot, qpos: Array) -> dict[str
 def link_poses(urdf: yourdfpy.URDF, robot: Robot, qpos: Array) -> dict[str, Array]:
     """Return the pose of every link in the world, as homogeneous matrices (steps, 4, 4); arguments as of `joint_transforms`."""
     base = np.tile(np.eye(4), (len(qpos), 1, 1))
-    base[:, :3, :3] = rotation_matrices(qpos[:, 3:7])
+    base[:, :3, :3] = matrix(torch.as_tensor(qpos[:, 3:7], dtype=torch.float64)).numpy()
     base[:, :3, 3] = qpos[:, :3]
-    relative, poses = joint_transforms(urdf, robot, qpos), {TRUNK: base}
-    parents = {joint.child: joint.parent for joint in urdf.robot.joints}
-
-    def pose(link: str) -> Array:
-        if link not in poses:
-            poses[link] = pose(parents[link]) @ relative[link]
-        return poses[link]
-
-    return {link.name: pose(link.name) for link in urdf.robot.links}
-
-
-def rotation_matrices(quat: Array) -> Array:
-    """Return the rotations of unit quaternions w x y z (steps, 4) as matrices (steps, 3, 3)."""
-    w, x, y, z = np.moveaxis(quat.astype(float), -1, 0)
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    relative = {TRUNK: base, **joint_transforms(urdf, robot, qpos)}
+    paths = link_paths(urdf)
+    return {link: reduce(np.matmul, [relative[part] for part in path.split("/")]) for link, path in paths.items()}
 
 
 def _shape(geometry: yourdfpy.urdf.Geometry | None) -> trimesh.Trimesh:
-    if geometry is not None and geometry.box is not None:
-        mesh = trimesh.creation.box(extents=geometry.box.size)
-    elif geometry is not None and geometry.cylinder is not None:
-        mesh = trimesh.creation.cylinder(radius=geometry.cylinder.radius, height=geometry.cylinder.length, sections=32)
-    elif geometry is not None and geometry.sphere is not None:
+    if geometry and geometry.sphere:
         return trimesh.creation.icosphere(subdivisions=3, radius=geometry.sphere.radius)
+    if geometry and geometry.box:
+        mesh = trimesh.creation.box(extents=geometry.box.size)
+    elif geometry and geometry.cylinder:
+        mesh = trimesh.creation.cylinder(radius=geometry.cylinder.radius, height=geometry.cylinder.length, sections=32)
     else:
         raise UserError("a drawing shows URDF shapes of type box, cylinder and sphere only")
     mesh.unmerge_vertices()  # sharp edges

@@ -10,13 +10,11 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from telebip.errors import UserError
-from telebip.eval.walk import heading_velocity
-from telebip.robot import FEET, Robot
+from telebip.robot import Robot
 from telebip.viz.render import Renderer
 from telebip.viz.scene import FORCE_SCALE, GROUND_FORCE, LANE, PUSH, PUSH_SCALE, Actor
-from telebip.viz.series import running_cost_of_transport, running_mean
+from telebip.viz.series import plots, running_mean
 
-SUFFIXES = (".mp4", ".gif")
 FPS = 25  # frames per second; a GIF counts in hundredths of a second, of which four are one frame
 Array = NDArray[np.floating]
 
@@ -65,11 +63,9 @@ def frame_rows(time: Array, start: float = 0.0) -> NDArray[np.integer]:
 
 
 def _pictures(actors: Sequence[Actor], robot: Robot, rows: NDArray[np.integer], size: tuple[int, int]) -> Iterator[Image.Image]:
-    path = camera_path(actors)
-    speeds, costs = zip(*(_speed_and_cost(actor) for actor in actors), strict=True)
-    font = ImageFont.load_default(size[1] / 22)
-    several = len(actors) > 1
-    width = LANE * (len(actors) - 1)
+    path, numbers = camera_path(actors), [_numbers(actor, robot) for actor in actors]
+    font, margin = ImageFont.load_default(size[1] / 22), size[1] // 36
+    several, width = len(actors) > 1, LANE * (len(actors) - 1)
     with Renderer(robot, size, extent=1.7 + width) as renderer:
         for row in rows:
             renderer.look_at([*path[row], 0.42], 1.7 + 0.6 * width, azimuth=125.0, elevation=-12.0)
@@ -78,11 +74,9 @@ def _pictures(actors: Sequence[Actor], robot: Robot, rows: NDArray[np.integer], 
             for actor, qpos, soles in zip(actors, poses, feet, strict=True):
                 _annotate(renderer, actor, row, qpos, soles, labelled=several)
             picture = Image.fromarray(renderer.render())
-            lines = [
-                f"{actor.label + ': ' if several else ''}{_numbers(speed[row], cost[row])}"
-                for actor, speed, cost in zip(actors, speeds, costs, strict=True)
-            ]
-            _write_lines(picture, [_headline(actors[0], row), *lines], font)
+            lines = [f"{actor.label}: {of[row]}" if several else of[row] for actor, of in zip(actors, numbers, strict=True)]
+            text = "\n".join([_headline(actors[0], row), *lines])
+            ImageDraw.Draw(picture).multiline_text((margin, margin), text, fill=(25, 30, 40), font=font, spacing=margin / 2)
             yield picture
 
 
@@ -90,8 +84,7 @@ def camera_path(actors: Sequence[Actor], seconds: float = 0.5) -> Array:
     """Return where the camera looks: the middle of the robots on the ground, without their sway [m], (steps, 2)."""
     places = np.mean([actor.rollout.qpos[:, actor.world, :2] + [0.0, actor.lane] for actor in actors], axis=0)
     half = max(1, round(0.5 * seconds / actors[0].rollout.step_dt))
-    sums = np.concatenate([np.zeros((1, 2)), np.cumsum(places, axis=0, dtype=float)])
-    row = np.arange(len(places))
+    sums, row = np.pad(np.cumsum(places, axis=0, dtype=float), ((1, 0), (0, 0))), np.arange(len(places))
     reach = np.minimum(half, np.minimum(row, len(places) - 1 - row))  # a window that stays centred up to the ends
     return (sums[row + reach + 1] - sums[row - reach]) / (2 * reach + 1)[:, None]
 
@@ -104,22 +97,21 @@ def _in_lane(actor: Actor, row: int) -> Array:
 
 def _annotate(renderer: Renderer, actor: Actor, row: int, qpos: Array, feet: Array, labelled: bool) -> None:
     """Add ground forces at the feet (2, 3) [m], the push on the trunk, and the label."""
-    for i in range(len(FEET)):
-        force = float(actor.rollout.foot_force[row, actor.world, i])
-        renderer.arrow(feet[i], feet[i] + [0.0, 0.0, FORCE_SCALE * force], GROUND_FORCE, radius=0.022)
+    for foot, force in zip(feet, actor.rollout.foot_force[row, actor.world], strict=True):
+        renderer.arrow(foot, foot + [0.0, 0.0, FORCE_SCALE * force], GROUND_FORCE, radius=0.022)
     trunk = qpos[:3] + [0.0, 0.0, 0.1]
     renderer.arrow(trunk, trunk + PUSH_SCALE * actor.rollout.push_w[row, actor.world], PUSH, radius=0.02)
     if labelled:
         renderer.label(qpos[:3] + [0.0, 0.0, 0.32], actor.label)
 
 
-def _speed_and_cost(actor: Actor) -> tuple[Array, Array]:
-    """Return forward speed [m/s] and running cost of transport, (steps,) each, both over the last second."""
-    rollout, world = actor.rollout, actor.world
-    window = round(1.0 / rollout.step_dt)
-    velocity = heading_velocity(rollout.qpos[:, world], rollout.qvel[:, world])
-    cost = running_cost_of_transport(rollout.joint_power[:, world].sum(-1), velocity, rollout.weight, window)
-    return running_mean(velocity[:, 0], window), cost
+def _numbers(actor: Actor, robot: Robot) -> list[str]:
+    """Return what is written of each row: forward speed and cost of transport, both over the last second."""
+    curves = plots(actor.rollout, actor.world, robot.is_slide)
+    speeds = running_mean(curves["speed"].curves["forward"].values, round(1.0 / actor.rollout.step_dt))
+    costs = curves["cost_of_transport"].curves["mechanical"].values
+    texts = [f"{cost:.2f}" if np.isfinite(cost) else "-" for cost in costs]
+    return [f"{speed:.2f} m/s, cost of transport {text}" for speed, text in zip(speeds, texts, strict=True)]
 
 
 def _headline(actor: Actor, row: int) -> str:
@@ -129,26 +121,14 @@ def _headline(actor: Actor, row: int) -> str:
     return f"command {vx:.2f} m/s{sideways}{turning}   {actor.rollout.time[row]:4.1f} s"
 
 
-def _numbers(speed: float, cost: float) -> str:
-    return f"{speed:.2f} m/s, cost of transport " + (f"{cost:.2f}" if np.isfinite(cost) else "-")
-
-
-def _write_lines(picture: Image.Image, lines: Sequence[str], font: ImageFont.FreeTypeFont | ImageFont.ImageFont) -> None:
-    margin = picture.height // 36
-    draw = ImageDraw.Draw(picture)
-    draw.multiline_text((margin, margin), "\n".join(lines), fill=(25, 30, 40), font=font, spacing=margin / 2)
-
-
 def _write_mp4(pictures: Iterator[Image.Image], file: Path) -> None:
     with av.open(str(file), "w", options={"movflags": "faststart"}) as container:
-        stream = None
-        for picture in pictures:
-            if stream is None:
-                stream = container.add_stream("libx264", rate=FPS, options={"crf": "20", "preset": "medium"})
-                stream.width, stream.height, stream.pix_fmt = picture.width, picture.height, "yuv420p"
+        first = next(pictures)
+        stream = container.add_stream("libx264", rate=FPS, options={"crf": "20", "preset": "medium"})
+        stream.width, stream.height, stream.pix_fmt = first.width, first.height, "yuv420p"
+        for picture in (first, *pictures):
             container.mux(stream.encode(av.VideoFrame.from_image(picture)))
-        if stream is not None:
-            container.mux(stream.encode(None))
+        container.mux(stream.encode(None))
 
 
 def _write_gif(pictures: Iterator[Image.Image], file: Path) -> None:

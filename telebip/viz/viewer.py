@@ -17,10 +17,11 @@ from telebip.errors import UserError
 from telebip.eval.walk import cost_of_transport, heading_velocity
 from telebip.rollout import walk
 from telebip.viz.opengl import has_display
+from telebip.viz.render import add_arrow
 from telebip.viz.scene import PUSH, PUSH_SCALE
 
 ENTER, BACKSPACE, RIGHT, LEFT, DOWN, UP, SPACE = 257, 259, 262, 263, 264, 265, 32  # GLFW's key codes
-SPEED_STEP, TURN_STEP = 0.1, 0.1  # per key press [m/s, rad/s]
+STEP = 0.1  # per key press [m/s | rad/s]
 PUSH_FORCE, PUSH_TIME = 60.0, 0.1  # to the right, and to the left the next time [N, s]
 KEYS = ("up, down\nleft, right\nEnter\nspace\nBackspace", "faster, slower\nturn\npush\npause\nreset")
 
@@ -41,10 +42,9 @@ class Steering:
 
     def press(self, key: int) -> None:
         """Take note of a key that went down; any other is left to the window. Called from the window's thread."""
-        if key in (UP, DOWN):
-            self.command[0] = round(self.command[0] + (SPEED_STEP if key == UP else -SPEED_STEP), 3)
-        elif key in (LEFT, RIGHT):
-            self.command[2] = round(self.command[2] + (TURN_STEP if key == LEFT else -TURN_STEP), 3)
+        if key in (UP, DOWN, LEFT, RIGHT):
+            i = 0 if key in (UP, DOWN) else 2
+            self.command[i] = round(self.command[i] + (STEP if key in (UP, LEFT) else -STEP), 3)
         elif key == SPACE:
             self.paused = not self.paused
         elif key == ENTER:
@@ -113,22 +113,10 @@ def steer(env: TelebipEnv, policy: Policy) -> None:
             steering.step()
             data.qpos[:], data.qvel[:] = env.sim.state.qpos[0].cpu().numpy(), env.sim.state.qvel[0].cpu().numpy()
             mujoco.mj_forward(model, data)
-            _draw_push(handle.user_scn, data.qpos[:3], steering.push)
+            handle.user_scn.ngeom, above = 0, data.qpos[:3] + [0.0, 0.0, 0.1]
+            add_arrow(handle.user_scn, above, above + [0.0, PUSH_SCALE * steering.push, 0.0], PUSH, radius=0.02)
             font, corner = mujoco.mjtFontScale.mjFONTSCALE_150, mujoco.mjtGridPos
-            handle.set_texts(
-                [(font, corner.mjGRID_TOPLEFT, *steering.numbers()), (font, corner.mjGRID_BOTTOMLEFT, *KEYS)],
-            )
+            handle.set_texts([(font, corner.mjGRID_TOPLEFT, *steering.numbers()), (font, corner.mjGRID_BOTTOMLEFT, *KEYS)])
             handle.sync()
             due = max(due + env.step_dt, time.perf_counter())
             time.sleep(max(0.0, due - time.perf_counter()))
-
-
-def _draw_push(scene: mujoco.MjvScene, trunk: np.ndarray, force: float) -> None:
-    """Let the scene of the window's user hold an arrow for the push, or nothing."""
-    scene.ngeom = int(force != 0.0)
-    if force:
-        arrow, start = mujoco.mjtGeom.mjGEOM_ARROW, trunk + [0.0, 0.0, 0.1]
-        rgba = np.array([*PUSH, 255], dtype=np.float32) / 255.0
-        mujoco.mjv_initGeom(scene.geoms[0], arrow, np.ones(3), np.zeros(3), np.eye(3).ravel(), rgba)
-        mujoco.mjv_connector(scene.geoms[0], arrow, 0.02, start, start + [0.0, PUSH_SCALE * force, 0.0])
-        scene.geoms[0].size[2] *= 2.0  # see `Renderer.arrow`

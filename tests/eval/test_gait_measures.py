@@ -79,16 +79,16 @@ def test_gait_of_feet_that_are_on_or_off() -> None:
     summary = summarise_gait(
         np.stack([right, left], -1)[:, None], np.stack([knees, knees], -1)[:, None], 0.7, 100.0, STEP_DT, clock=0.5
     )
-    assert summary.period_s == pytest.approx(0.5, abs=1e-3)
-    assert summary.duty_factor == pytest.approx(15 / 25)
-    assert summary.double_support == pytest.approx(5 / 25)
-    assert summary.flight == 0.0
-    assert summary.peak_force_bw == pytest.approx(1.0)
-    assert summary.stride_length_m == pytest.approx(0.35, abs=1e-3)
-    assert summary.knee_stroke_m == pytest.approx(0.06, abs=1e-3)
+    assert summary["period_s"] == pytest.approx(0.5, abs=1e-3)
+    assert summary["duty_factor"] == pytest.approx(15 / 25)
+    assert summary["double_support"] == pytest.approx(5 / 25)
+    assert summary["flight"] == 0.0
+    assert summary["peak_force_bw"] == pytest.approx(1.0)
+    assert summary["stride_length_m"] == pytest.approx(0.35, abs=1e-3)
+    assert summary["knee_stroke_m"] == pytest.approx(0.06, abs=1e-3)
 
 
 def test_a_robot_without_prismatic_knees_has_no_stroke() -> None:
     summary = summarise_gait(feet(0.5), np.zeros((500, 1, 0)), 0.7, WEIGHT, STEP_DT, clock=0.5)
-    assert math.isnan(summary.knee_stroke_m)
-    assert summary.period_s == pytest.approx(0.5, abs=1e-3)
+    assert math.isnan(summary["knee_stroke_m"])
+    assert summary["period_s"] == pytest.approx(0.5, abs=1e-3)

@@ -1,4 +1,4 @@
-"""`FastPPO` against rsl-rl's own PPO, from the same weights, rollout and shuffle."""
+"""`FusedPPO` against rsl-rl's own PPO, from the same weights, rollout and shuffle."""
 
 import copy
 from pathlib import Path
@@ -7,14 +7,13 @@ from typing import Any
 import pytest
 import torch
 from rsl_rl.algorithms import PPO
-from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 
 from telebip.config import load_task
 from telebip.env import TelebipEnv
 from telebip.rl.learner import ALGORITHM
 from telebip.rl.networks import Gaussian
-from telebip.rl.ppo import FastPPO, ShuffledStorage
+from telebip.rl.ppo import FusedPPO
 from telebip.rl.train import Trainer
 from telebip.robot import Robot
 from tests.worlds import HostReads
@@ -43,9 +42,7 @@ def rollout(robot: Robot, *overrides: str) -> tuple[Trainer, torch.Tensor]:
 def stock_copy(learner: PPO) -> PPO:
     """Return rsl-rl's PPO with the learner's weights, optimiser and rollout."""
     settings: dict[str, Any] = {name: getattr(learner, name) for name in ALGORITHM}
-    storage = copy.deepcopy(learner.storage)
-    storage.__class__ = RolloutStorage
-    stock = PPO(copy.deepcopy(learner.actor), copy.deepcopy(learner.critic), storage, **settings)
+    stock = PPO(copy.deepcopy(learner.actor), copy.deepcopy(learner.critic), copy.deepcopy(learner.storage), **settings)
     state = copy.deepcopy(learner.optimizer.state_dict())
     for group in state["param_groups"]:
         group["fused"] = None
@@ -61,7 +58,7 @@ PRECISIONS = pytest.mark.parametrize("precision", ["never", "always"])
 @pytest.mark.parametrize("overrides", [(), ("ppo.schedule=fixed",), ("ppo.num_mini_batches=3", "ppo.obs_normalization=false")])
 def test_an_update_equals_rsl_rls(robot: Robot, overrides: tuple[str, ...], precision: str) -> None:
     learner = rollout(robot, f"ppo.mixed_precision={precision}", "ppo.learning_rate=0.001", *overrides)[0].learner
-    assert type(learner) is FastPPO and type(learner.storage) is ShuffledStorage
+    assert type(learner) is FusedPPO
     stock = stock_copy(learner)
     before = copy.deepcopy(learner.save())
     losses = []
@@ -81,18 +78,6 @@ def test_an_update_equals_rsl_rls(robot: Robot, overrides: tuple[str, ...], prec
     assert all(group.pop("fused") for group in moments["param_groups"])
     assert not any(group.pop("fused") for group in expected["param_groups"])
     assert moments["param_groups"] == expected["param_groups"]
-
-
-def test_mini_batches_are_rsl_rls_bit_for_bit(robot: Robot) -> None:
-    storage: Any = rollout(robot, "ppo.num_mini_batches=3")[0].learner.storage
-    batches = []
-    for kind in (ShuffledStorage, RolloutStorage):
-        torch.manual_seed(7)
-        batches.append([vars(batch) for batch in kind.mini_batch_generator(storage, 3, 2)])
-    assert len(batches[0]) == len(batches[1]) == 6
-    for ours, theirs in zip(*batches, strict=True):
-        assert (ours.pop("observations") == theirs.pop("observations")).all()
-        torch.testing.assert_close(ours, theirs, rtol=0.0, atol=0.0)
 
 
 @PRECISIONS

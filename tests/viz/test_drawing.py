@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
@@ -13,12 +12,6 @@ from telebip.robot import Robot
 from telebip.rollout import Rollout
 from telebip.viz.drawing import AXIS_COLORS, LEARNING, draw_control_loop, draw_learning, draw_robot, draw_stride
 from telebip.viz.scene import line_up
-
-
-@pytest.fixture(autouse=True)
-def close_figures():
-    yield
-    plt.close("all")
 
 
 def words(figure: Figure) -> str:

@@ -72,9 +72,9 @@ def test_a_link_is_one_mesh_in_its_colours(robot: Robot) -> None:
     foot, thigh = link_mesh(urdf, "right_foot"), link_mesh(urdf, "right_thigh")
     assert foot is not None and thigh is not None
     np.testing.assert_allclose(np.linalg.norm(foot.vertices, axis=1), 0.03, atol=1e-9)
-    assert {tuple(color) for color in foot.colors.tolist()} == {(20, 20, 23, 255)}
+    assert {tuple(color) for color in foot.visual.vertex_colors.tolist()} == {(20, 20, 23, 255)}
     np.testing.assert_allclose(thigh.vertices[:, 2].min(), -0.364, atol=1e-9)  # the collar's lower end
-    assert len({tuple(color) for color in thigh.colors.tolist()}) == 2  # tube and housing
+    assert len({tuple(color) for color in thigh.visual.vertex_colors.tolist()}) == 2  # tube and housing
     assert thigh.faces.max() == len(thigh.vertices) - 1
 
 
