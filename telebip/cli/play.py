@@ -153,15 +153,13 @@ def _policy(who: str, env, overrides: Sequence[str]):
 
 
 def _lines(s) -> str:
+    transport = f"{s.cost_of_transport:.3f} mechanical, {s.cost_of_transport_article:.3f} by the article's formula"
     rows = (
         ("command", f"{s.command[0]:.2f} m/s forward, {s.command[1]:.2f} m/s left, {s.command[2]:.2f} rad/s"),
         ("mean speed", f"{s.speed[0]:.3f} m/s forward (spread over worlds {s.speed_spread:.3f}), {s.speed[1]:.3f} m/s left"),
         ("tracking error", f"{s.lin_vel_error:.3f} m/s (mean of ||v_cmd - v||), yaw rate {s.yaw_rate:+.3f} rad/s"),
         ("heading drift", f"{s.yaw_drift_deg:.1f} deg at the end"),
-        (
-            "cost of transport",
-            f"{s.cost_of_transport:.3f} mechanical, {s.cost_of_transport_article:.3f} by the article's formula",
-        ),
+        ("cost of transport", transport),
         ("gait period", f"{s.gait_period:.3f} s"),
         ("falls", f"{s.falls} (all else is measured after the first {s.skipped:g} s)"),
     )

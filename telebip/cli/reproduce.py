@@ -81,6 +81,7 @@ def _read(file: Path):
 def _train(console, training, seed: int, options: argparse.Namespace) -> Path | None:
     """Train, or go on training, one policy; return its run folder, or None if the user stopped it."""
     from telebip.cli.train import Start, train
+    from telebip.eval.report import make_folder
 
     run_dir = Path(options.runs) / f"{training.name}-seed{seed}"
     config = load_task(training.task, [*training.overrides, *(QUICK_TRAINING if options.quick else ())])
@@ -89,10 +90,7 @@ def _train(console, training, seed: int, options: argparse.Namespace) -> Path | 
     if checkpoint and checkpoint.iteration >= config.ppo.max_iterations:
         console.print(f"{training.name}, seed {seed}: trained already, {checkpoint.samples / 1e6:.1f} M samples in {run_dir}")
         return run_dir
-    try:
-        run_dir.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"cannot write to '{run_dir}': {error.strerror or error}") from error
+    make_folder(run_dir)
     console.print(f"{training.name}, seed {seed}: training in {run_dir}")
     start = Start(training.task, config, run_dir=run_dir, checkpoint=checkpoint)
     return run_dir if train(start, options.device) else None

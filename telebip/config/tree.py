@@ -70,8 +70,7 @@ def merge(base: Tree, layer: Tree, is_whole: Callable[[str], bool], prefix: str 
     merged = dict(base)
     for name, entry in layer.items():
         below, key = base.get(name), f"{prefix}{name}"
-        are_sections = below and below.is_section and entry.is_section
-        if are_sections and not is_whole(key) and not _is_of_another_term(entry, below, name):
+        if below and below.is_section and entry.is_section and not (is_whole(key) or _is_of_another_term(entry, below, name)):
             entry = Entry(merge(below.value, entry.value, is_whole, f"{key}."), entry.where)
         elif entry.value is None:
             entry = Entry(None, entry.where, removes=below is not None)

@@ -10,7 +10,7 @@ bipedal walking via H-LIP based gait synthesis and stepping stabilization", IEEE
 import torch
 from torch import Tensor
 
-from telebip.control.pendulum import Pendulum, Step, mean_to_end_speed
+from telebip.control.pendulum import Pendulum, Step
 
 
 def predict_ang_mom(pendulum: Pendulum, time: Tensor) -> Tensor:
@@ -43,23 +43,17 @@ def foot_placement(pendulum: Pendulum, step: Step) -> Tensor:
         L* = P(-s) + a (L^ - P(s))
         P_y = m H v_x k,    P_x(s) = -m H v_y k + s m H (W / 2) w sinh(w T) / (1 + cosh(w T)),    k = (w T / 2) / tanh(w T / 2)
 
-    P(s) is the momentum with which the walk that repeats ends a step on side s: k makes v the mean speed (Gong and Grizzle aim
-    at m H v_x; k is the correction from the speed in the middle of the step), and the last term is the sway of stepping in
-    place. A step leaves the share a of the momentum's error. At a = 0, Gong and Grizzle's law, nothing is left, but the steps
-    that this takes after a push run into the bound of the reach, and throwing the leg so far turns the robot. At a = e^{-w T}
-    the answer to an error is smaller by the factor tanh(w T): the DCM walker's, were L just m H times the velocity.
-
-    Args:
-        pendulum: the present state.
-        step: the present step and the wanted walk; touch-down is `step.time_left` away.
-
-    Returns:
-        Touch-down relative to the centre of mass then, (t_x, t_y) [m], (2, num_envs).
+    P(s) is the momentum with which the walk that repeats ends a step on side s: k is the speed at the end of a step over its
+    mean, so that v is the mean (Gong and Grizzle aim at m H v_x, the speed in the middle, where it is least), and the last term
+    is the sway of stepping in place. A step leaves the share a of the momentum's error. At a = 0, Gong and Grizzle's law,
+    nothing is left, but the steps that this takes after a push run into the bound of the reach, and throwing the leg so far
+    turns the robot. At a = e^{-w T} the answer to an error is smaller by the factor tanh(w T): the DCM walker's, were L just
+    m H times the velocity. Arguments and result are those of a `telebip.control.pendulum.Placement`.
     """
-    mh = pendulum.mass * pendulum.height
-    sinh, cosh = torch.sinh(pendulum.rate * step.time), torch.cosh(pendulum.rate * step.time)
+    mh, angle = pendulum.mass * pendulum.height, pendulum.rate * step.time
+    sinh, cosh = angle.sinh(), angle.cosh()
     at_touch_down = predict_ang_mom(pendulum, step.time_left)
-    along, across = mh * mean_to_end_speed(pendulum.rate, step.time) * step.velocity
+    along, across = mh * (0.5 * angle / torch.tanh(0.5 * angle)) * step.velocity
     sway = step.side * mh * (0.5 * step.width) * pendulum.rate * sinh / (1.0 + cosh)
     error = at_touch_down - torch.stack([sway - across, along])
     wanted = torch.stack([-sway - across, along]) + step.error_kept * error

@@ -51,13 +51,7 @@ def foot_placement(pendulum: Pendulum, step: Step) -> Tensor:
         p = xi_T - b(-s) - a (e^{-w T} xi_T - b(s)),    t = p - c_T
 
     The share a of the DCM's error xi_T - e^{w T} b(s) stays at the end of the next step; Englsberger's law has a = 0.
-
-    Args:
-        pendulum: the present state.
-        step: the present step and the wanted walk; touch-down is `step.time_left` away.
-
-    Returns:
-        Touch-down relative to the centre of mass then, (t_x, t_y) [m], (2, num_envs).
+    Arguments and result are those of a `telebip.control.pendulum.Placement`.
     """
     dcm = predict_dcm(pendulum, step.time_left)
     present, coming = (dcm_offset(pendulum.rate, step, side) for side in (step.side, -step.side))

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 
@@ -37,17 +36,7 @@ class Step:
 
 
 Placement = Callable[[Pendulum, Step], Tensor]
-"""A foot placement law: where to touch down, relative to the centre of mass at that time [m], (2, num_envs)."""
+"""A foot placement law: from the present pendulum and step to where to touch down, `Step.time_left` from now.
 
-
-def mean_to_end_speed(rate: Tensor, time: float) -> Tensor:
-    r"""Speed at the end of a periodic step over its mean speed, (w T / 2) / tanh(w T / 2).
-
-    A pendulum that goes from -v T / 2 to v T / 2 in T is slowest in the middle.
-
-    Args:
-        rate: w [1/s], (num_envs,).
-        time: T [s].
-    """
-    half = 0.5 * time * rate
-    return half / torch.tanh(half)
+It returns t = (t_x, t_y), relative to the centre of mass at that time [m], (2, num_envs).
+"""

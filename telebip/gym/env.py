@@ -26,15 +26,12 @@ Array = NDArray[np.float32]
 class TelebipVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
     """`num_envs` worlds that reset in the step that ends their episode (`AutoresetMode.SAME_STEP`).
 
-    The task's group of observations `policy` is what they return. Where an episode ended, `infos["final_obs"]` has its last
-    observation, and `infos["_final_obs"]` is true. A fall terminates, a time-out truncates. Names of the numbers:
+    They return the task's group of observations `policy`. Where an episode ended, `infos["final_obs"]` has its last one, and
+    `infos["_final_obs"]` is true. A fall terminates, a time-out truncates. Names of the numbers:
     `metadata["observation_names"]` and `metadata["action_names"]`.
     """
 
-    metadata: dict[str, Any] = {  # noqa: RUF012 (Gymnasium's own declaration)
-        "autoreset_mode": AutoresetMode.SAME_STEP,
-        "render_modes": [],
-    }
+    metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012 (Gymnasium's)
 
     def __init__(
         self,
@@ -86,12 +83,8 @@ class TelebipVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
             obs, rewards, dones, extras = self.worlds.step(clipped)
         done, truncated = _numpy(dones), _numpy(extras["time_outs"])
         infos: dict[str, Any] = {}
-        if done.any():
-            final = np.full(self.num_envs, None, dtype=object)  # as Gymnasium's own vector environments have it
-            rows = np.flatnonzero(done)
-            for row, last in zip(rows, _numpy(extras["final_obs"]["policy"])[rows], strict=True):
-                final[row] = last
-            infos = {"final_obs": final, "_final_obs": done.copy()}
+        for row in np.flatnonzero(done):
+            infos = self._add_info(infos, {"final_obs": _numpy(extras["final_obs"]["policy"][row])}, row)
         return _numpy(obs["policy"]), _numpy(rewards), done & ~truncated, truncated, infos
 
 
@@ -120,8 +113,7 @@ class TelebipSingleEnv(gymnasium.Env[Array, Array]):
 def action_space(robot: Robot, scale: NDArray[np.floating]) -> Box:
     """Return the bounds of an action [-]: joint targets as far outside of the joint's range as saturates its actuator.
 
-    From there on a larger action changes nothing for a joint at rest, wherever in its range it stands. `scale` is the
-    displacement of each joint's target per unit of action [rad | m], (num_joints,).
+    `scale` is the displacement of each joint's target per unit of action [rad | m], (num_joints,).
     """
     beyond = robot.force_limit / robot.model.actuator_gainprm[:, 0]
     low = (robot.joint_range[:, 0] - beyond - robot.nominal) / scale
@@ -142,18 +134,18 @@ def observation_space(cfg: TaskConfig, group: Group, actions: Box) -> Box:
     ranges = np.array([command.lin_vel_x, command.lin_vel_y, command.ang_vel_z]) + [[0.0, 0.0], [0.0, 0.0], [-turn, turn]]
     bounds = {
         "last_action": (actions.low, actions.high),
-        "base_quat": (np.array([0.0, -1.0, -1.0, -1.0]), np.ones(4)),
-        "projected_gravity": (-np.ones(3), np.ones(3)),
+        "base_quat": (np.array([0.0, -1.0, -1.0, -1.0]), 1.0),
+        "projected_gravity": (-1.0, 1.0),
         "command": (ranges[:, 0], ranges[:, 1]),
-        "phase": (-np.ones(2), np.ones(2)),
+        "phase": (-1.0, 1.0),
     }
-    rounding = 1e-6  # what is exactly at its bound may lie a rounding error outside of it
     lows, highs = [], []
     for part in group.parts:
         term = cfg.observations[group.name].terms[part.name].get("term", part.name)
-        low, high = bounds.get(term, (np.full(part.size, -np.inf), np.full(part.size, np.inf)))
-        lows.append(low - part.noise - rounding)
-        highs.append(high + part.noise + rounding)
+        low, high = bounds.get(term, (-np.inf, np.inf))
+        margin = np.full(part.size, part.noise + 1e-6)  # what is exactly at its bound may lie a rounding error outside of it
+        lows.append(low - margin)
+        highs.append(high + margin)
     low, high = (np.tile(np.concatenate(side), group.history).astype(np.float32) for side in (lows, highs))
     return Box(low, high, dtype=np.float32)
 

@@ -43,11 +43,8 @@ class Gallery:
         self.rollout = self._walk(lambda env: load_policy(checkpoint, "cpu"))
         self.actors = line_up([("RL", self.rollout)])
 
-    def _worlds(self) -> TelebipEnv:
-        return TelebipEnv(self.config, self.robot, "cpu", "native")
-
     def _walk(self, make_policy: Callable[[TelebipEnv], Policy]) -> Rollout:
-        env = self._worlds()
+        env = TelebipEnv(self.config, self.robot, "cpu", "native")
         env.set_command(*self.command)
         return roll_out(env, make_policy(env), round(SECONDS / env.step_dt))
 
@@ -68,7 +65,7 @@ class Gallery:
 
     def control_loop(self, file: Path) -> None:
         """The control loop as a diagram."""
-        observation = {part["name"]: part["size"] for part in self._worlds().layout()["policy"]}
+        observation = {part["name"]: part["size"] for part in self.checkpoint.observations["policy"]}
         _save(draw_control_loop(self.checkpoint.config, self.robot, observation), file)
 
     def stride(self, file: Path) -> None:
@@ -131,6 +128,5 @@ def _save(figure: Figure, file: Path) -> None:
 def _shrink(file: Path, width: int | None = None) -> None:
     """Keep a PNG small: at most `width` pixels wide, 256 colours."""
     picture = Image.open(file).convert("RGB")
-    if width and picture.width > width:
-        picture = picture.resize((width, round(picture.height * width / picture.width)), Image.Resampling.LANCZOS)
+    picture.thumbnail((width or picture.width, picture.height), Image.Resampling.LANCZOS)
     picture.quantize(256, method=Image.Quantize.MAXCOVERAGE, kmeans=2, dither=Image.Dither.NONE).save(file, optimize=True)

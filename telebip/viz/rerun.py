@@ -1,4 +1,4 @@
-# pyright: reportAttributeAccessIssue=false
+# pyright: reportAttributeAccessIssue=false, reportOptionalMemberAccess=false
 """Recordings of walks for the rerun viewer: the robots in 3D beside their time series, logged in columns."""
 
 import re

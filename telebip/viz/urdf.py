@@ -7,6 +7,7 @@ import torch
 import trimesh
 import yourdfpy
 from numpy.typing import NDArray
+from trimesh.visual import ColorVisuals
 
 from telebip.errors import UserError, nearest
 from telebip.math import matrix
@@ -58,9 +59,9 @@ def link_mesh(urdf: yourdfpy.URDF, link: str) -> trimesh.Trimesh | None:
         if visual.origin is not None:
             mesh.apply_transform(visual.origin)
         color = palette.get(visual.material.name, GREY) if visual.material else GREY
-        mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=np.round(255 * np.asarray(color)).astype(np.uint8))
+        mesh.visual = ColorVisuals(mesh, vertex_colors=np.round(255 * np.asarray(color)).astype(np.uint8))
         meshes.append(mesh)
-    return trimesh.util.concatenate(meshes) if meshes else None
+    return trimesh.util.concatenate(meshes) if meshes else None  # pyright: ignore[reportReturnType]
 
 
 def joint_transforms(urdf: yourdfpy.URDF, robot: Robot, qpos: Array) -> dict[str, Array]:

@@ -1,4 +1,4 @@
-# pyright: reportAttributeAccessIssue=false
+# pyright: reportAttributeAccessIssue=false, reportOptionalMemberAccess=false
 """Links are drawn where MuJoCo has them, in the shapes and colours of the URDF."""
 
 from dataclasses import replace
