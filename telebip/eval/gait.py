@@ -56,11 +56,11 @@ def rhythm(foot_force: Array, step_dt: float) -> tuple[float, float]:
 
     Args:
         foot_force: normal forces on the right and the left foot [N], (steps, num_envs, 2).
-        step_dt: time between rows [s].
+        step_dt: dt, time between rows [s].
 
     Returns:
         Period [s], median over the worlds that have one, NaN if there are fewer than two periods or half of the worlds have
-        no rhythm (R < 0.3); regularity, mean over worlds, 0 for those without a peak.
+        no rhythm (R < 0.3); regularity [-], mean over worlds, 0 for those without a peak.
     """
     lags = min(round(LONGEST_PERIOD / step_dt), len(foot_force) // 2)
     if lags < 3:

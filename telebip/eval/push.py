@@ -56,13 +56,7 @@ def largest_survived(survived: NDArray[np.bool_], forces: NDArray[np.floating]) 
 
 
 def push_limits(survival_s: NDArray[np.floating], protocol: PushProtocol, weight: float) -> dict[str, dict[str, Any]]:
-    """Reduce survival times to limits.
-
-    Args:
-        survival_s: time that each world walked under pushes before it fell [s], infinite if it did not,
-            (forces, directions, worlds).
-        protocol: what was done.
-        weight: m g [N].
+    """Reduce the survival times of `push_trial` to limits; `weight` is m g [N].
 
     Returns:
         For each horizon ("10s"): `forward_n`, `backward_n`, `lateral_n` (of left and right the worse) [N], the same as impulses

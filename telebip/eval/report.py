@@ -66,7 +66,9 @@ def read_results(path: Path) -> Results:
 def can_be_shown(results: Results) -> bool:
     """Whether results hold all that tables and pictures show of them, which older and damaged ones may not."""
     try:
-        _tables([results]), [*_comparisons([results], [])], [*_figures_of_each([results])]
+        _tables([results])
+        list(_comparisons([results], []))
+        list(_figures_of_each([results]))
     except (AttributeError, IndexError, KeyError, TypeError, ValueError):
         return False
     return True

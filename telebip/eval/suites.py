@@ -65,11 +65,7 @@ class Protocol:
 
 
 def check_suites(names: Sequence[str]) -> tuple[str, ...]:
-    """Return the suites of these names in the order in which they run.
-
-    Raises:
-        UserError: there is no suite of a name.
-    """
+    """Return the suites of these names in the order in which they run; a UserError tells of one that is unknown."""
     for name in names:
         if name not in SUITES:
             raise UserError(f"unknown suite '{name}'; {nearest(name, SUITES)}")

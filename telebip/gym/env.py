@@ -84,7 +84,7 @@ class TelebipVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
         done, truncated = _numpy(dones), _numpy(extras["time_outs"])
         infos: dict[str, Any] = {}
         for row in np.flatnonzero(done):
-            infos = self._add_info(infos, {"final_obs": _numpy(extras["final_obs"]["policy"][row])}, row)
+            infos = self._add_info(infos, {"final_obs": _numpy(extras["final_obs"]["policy"][row])}, int(row))
         return _numpy(obs["policy"]), _numpy(rewards), done & ~truncated, truncated, infos
 
 

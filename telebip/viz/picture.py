@@ -20,7 +20,7 @@ def strobe(
         actor: who walked.
         robot: its model.
         file: an image file; the suffix decides the format.
-        interval: time between poses [s]; a multiple of the gait period would freeze the legs, so it should not be one.
+        interval: time between poses [s]; a multiple of the gait period would freeze the legs.
         poses: how many.
         size: width and height of the picture [pixels].
 

@@ -27,7 +27,7 @@ class Renderer:
             robot: whose model is drawn.
             size: width and height of the pictures [pixels].
             extent: how far shadows reach [m].
-            shadow_size: of the map of shadows [pixels]; without a GPU most of the time goes into it.
+            shadow_size: of the map of shadows [pixels], into which most of the time goes without a GPU.
 
         Raises:
             UserError: there is no OpenGL.

@@ -26,12 +26,7 @@ from telebip.viz.urdf import Array, joint_transforms, link_mesh, link_paths, loa
 
 
 def record(actors: Sequence[Actor], robot: Robot, file: Path) -> None:
-    """Write walks to a `.rrd` file, with a prepared layout.
-
-    Args:
-        actors: who walked, from `telebip.viz.scene.line_up`.
-        robot: their model; its URDF stands beside its MJCF, see `telebip.viz.urdf.load_urdf`.
-        file: where to write; its folder is made.
+    """Write walks, from `telebip.viz.scene.line_up`, of `robot` to a `.rrd` file, with a prepared layout; its folder is made.
 
     Raises:
         UserError: the file cannot be written, or the URDF is missing or has shapes that cannot be drawn.

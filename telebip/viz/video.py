@@ -1,6 +1,7 @@
 """A walk as a film, MP4 or GIF: rendered without a window, the camera beside the robot, with what it does written above."""
 
 from collections.abc import Callable, Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 
 import av
@@ -81,7 +82,7 @@ def _pictures(actors: Sequence[Actor], robot: Robot, rows: NDArray[np.integer], 
 
 
 def camera_path(actors: Sequence[Actor], seconds: float = 0.5) -> Array:
-    """Return where the camera looks: the middle of the robots on the ground, without their sway [m], (steps, 2)."""
+    """Return where the camera looks: the middle of the robots on the ground [m], (steps, 2), means over `seconds`."""
     places = np.mean([actor.rollout.qpos[:, actor.world, :2] + [0.0, actor.lane] for actor in actors], axis=0)
     half = max(1, round(0.5 * seconds / actors[0].rollout.step_dt))
     sums, row = np.pad(np.cumsum(places, axis=0, dtype=float), ((1, 0), (0, 0))), np.arange(len(places))
@@ -126,7 +127,7 @@ def _write_mp4(pictures: Iterator[Image.Image], file: Path) -> None:
         first = next(pictures)
         stream = container.add_stream("libx264", rate=FPS, options={"crf": "20", "preset": "medium"})
         stream.width, stream.height, stream.pix_fmt = first.width, first.height, "yuv420p"
-        for picture in (first, *pictures):
+        for picture in chain([first], pictures):
             container.mux(stream.encode(av.VideoFrame.from_image(picture)))
         container.mux(stream.encode(None))
 
@@ -138,5 +139,5 @@ def _write_gif(pictures: Iterator[Image.Image], file: Path) -> None:
     for i, color in enumerate((GROUND_FORCE, PUSH)):
         sample.paste(color, (0, 8 * i, first.width // 4, 8 * i + 8))
     palette = sample.quantize(160, dither=Image.Dither.NONE)
-    frames = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in (first, *pictures)]
+    frames = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in chain([first], pictures)]
     frames[0].save(file, save_all=True, append_images=frames[1:], duration=1000 // FPS, loop=0, optimize=False)

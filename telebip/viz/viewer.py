@@ -33,12 +33,10 @@ class Steering:
         """Start at the environment's present command; random pushes, if there are any, leave no room for the user's."""
         self.env, self.policy = env, policy
         self.command = env.state.target_command[0].tolist()  # forward, left, yaw rate [m/s, m/s, rad/s]
-        self.paused = False
         self.push = 0.0  # to the left [N]
-        self._start = list(self.command)
+        self._start, self._paused, self._restart = list(self.command), False, True
         self._push_left, self._next_push = 0, -PUSH_FORCE  # policy steps, N
         self._latest: deque[tuple[float, float, float]] = deque(maxlen=round(1.0 / env.step_dt))  # power and velocity
-        self._restart = True
 
     def press(self, key: int) -> None:
         """Take note of a key that went down; any other is left to the window. Called from the window's thread."""
@@ -46,7 +44,7 @@ class Steering:
             i = 0 if key in (UP, DOWN) else 2
             self.command[i] = round(self.command[i] + (STEP if key in (UP, LEFT) else -STEP), 3)
         elif key == SPACE:
-            self.paused = not self.paused
+            self._paused = not self._paused
         elif key == ENTER:
             self._push_left = max(1, round(PUSH_TIME / self.env.step_dt))
             self.push, self._next_push = self._next_push, -self._next_push
@@ -62,7 +60,7 @@ class Steering:
             env.reset()
             self._walk = walk(env, self.policy)
             self._latest.clear()
-        if self.paused:
+        if self._paused:
             return
         env.set_command(*self.command)
         self.push = self.push if self._push_left else 0.0
