@@ -1,6 +1,6 @@
 """Fixtures that several tests share: the robot, and real worlds made from the published task and overrides."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import pytest
 import torch
@@ -18,6 +18,14 @@ from telebip.robot import Robot, load_robot
 from telebip.sim import Backend
 
 torch.set_num_threads(1)
+
+
+@pytest.fixture(params=[1, 2])
+def torch_threads(request: pytest.FixtureRequest) -> Iterator[int]:
+    """Let a test run with one thread of torch and with two."""
+    torch.set_num_threads(request.param)
+    yield request.param
+    torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session")

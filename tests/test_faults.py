@@ -162,12 +162,13 @@ def test_a_healthy_step_replays_bit_for_bit(make_env: MakeEnv, tmp_path: Path, o
     env = make_env(NEVER_FALL, *overrides, num_envs=NUM_ENVS)
     for action in random_actions(10, NUM_ENVS, 0.5):
         env.step(action)
-    seen = {}
+    seen, reset = {}, env.sim.reset
 
-    def step_without_reset(mask: Tensor) -> None:
+    def noted_reset(mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
         seen["qpos"] = env.sim.state.qpos[BAD].clone()
+        reset(mask, qpos, qvel)
 
-    env._reset = step_without_reset  # type: ignore[method-assign]
+    env.sim.reset = noted_reset  # type: ignore[method-assign]
     env.step(break_action(env, torch.zeros(NUM_ENVS, 6)))
     again = replay(load_fault(save_fault(tmp_path, "non_finite_action", env.take_faults()["non_finite_action"], "t", env)))
     assert torch.equal(again.states[-1]["qpos"][0], seen["qpos"])

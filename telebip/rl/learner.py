@@ -10,7 +10,7 @@ from telebip.errors import UserError
 from telebip.mdp.curriculum import share
 from telebip.rl.distributed import Ranks
 from telebip.rl.networks import actor_cfg, critic_cfg, network_class
-from telebip.rl.ppo import FusedPPO
+from telebip.rl.ppo import FastPPO
 
 ALGORITHM = (
     *("num_learning_epochs", "num_mini_batches", "learning_rate", "schedule", "desired_kl", "gamma", "lam", "clip_param"),
@@ -24,7 +24,7 @@ def make_learner(
     ppo: PpoConfig,
     obs_groups: dict[str, list[str]],
     ranks: Ranks,
-    algorithm: type[PPO] = FusedPPO,
+    algorithm: type[PPO] = FastPPO,
 ) -> PPO:
     """Return a learner with new networks, which draw their weights from torch's generator, the same in every process.
 

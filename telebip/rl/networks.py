@@ -31,15 +31,19 @@ class Bfloat16Model(MLPModel):
         self, obs: TensorDict, masks: Tensor | None = None, hidden_state: Any = None, stochastic_output: bool = False
     ) -> Tensor:
         """Return actions or values, see `MLPModel`."""
-        latent = self.get_latent(obs, masks, hidden_state)
-        with torch.autocast(latent.device.type, torch.bfloat16):
-            output = self.mlp(latent).float()
+        value = output(self, self.get_latent(obs, masks, hidden_state))
         if self.distribution is None:
-            return output
+            return value
         if not stochastic_output:
-            return self.distribution.deterministic_output(output)
-        self.distribution.update(output)
+            return self.distribution.deterministic_output(value)
+        self.distribution.update(value)
         return self.distribution.sample()
+
+
+def output(network: MLPModel, latent: Tensor) -> Tensor:
+    """Return what a network makes of normalised observations (num_envs, size), before its distribution, in its arithmetic."""
+    with torch.autocast(latent.device.type, torch.bfloat16, enabled=isinstance(network, Bfloat16Model)):
+        return network.mlp(latent).float()
 
 
 def network_class(mixed_precision: str, device: torch.device) -> type[MLPModel]:

@@ -1,4 +1,4 @@
-"""`FusedPPO` against rsl-rl's own PPO, from the same weights, rollout and shuffle."""
+"""`FastPPO` against rsl-rl's own PPO, from the same weights, rollout and shuffle."""
 
 import copy
 from pathlib import Path
@@ -13,7 +13,7 @@ from telebip.config import load_task
 from telebip.env import TelebipEnv
 from telebip.rl.learner import ALGORITHM
 from telebip.rl.networks import Gaussian
-from telebip.rl.ppo import FusedPPO
+from telebip.rl.ppo import FastPPO
 from telebip.rl.train import Trainer
 from telebip.robot import Robot
 from tests.worlds import HostReads
@@ -55,13 +55,14 @@ PRECISIONS = pytest.mark.parametrize("precision", ["never", "always"])
 
 
 @PRECISIONS
+@pytest.mark.usefixtures("torch_threads")
 @pytest.mark.parametrize("overrides", [(), ("ppo.schedule=fixed",), ("ppo.num_mini_batches=3", "ppo.obs_normalization=false")])
 def test_an_update_equals_rsl_rls(robot: Robot, overrides: tuple[str, ...], precision: str) -> None:
     learner = rollout(robot, f"ppo.mixed_precision={precision}", "ppo.learning_rate=0.001", *overrides)[0].learner
-    assert type(learner) is FusedPPO
+    assert type(learner) is FastPPO
     stock = stock_copy(learner)
     before = copy.deepcopy(learner.save())
-    losses = []
+    losses, threads = [], torch.get_num_threads()
     for ppo in (stock, learner):
         torch.manual_seed(7)  # of the shuffle
         losses.append(ppo.update())
@@ -75,6 +76,7 @@ def test_an_update_equals_rsl_rls(robot: Robot, overrides: tuple[str, ...], prec
             torch.testing.assert_close(learner.save()[part][name], expected, rtol=1e-4 * loose, atol=1e-5 * loose)
             assert name.endswith("._std") or not torch.equal(before[part][name], expected), name
     moments, expected = learner.optimizer.state_dict(), stock.optimizer.state_dict()
+    assert torch.get_num_threads() == threads
     assert all(group.pop("fused") for group in moments["param_groups"])
     assert not any(group.pop("fused") for group in expected["param_groups"])
     assert moments["param_groups"] == expected["param_groups"]

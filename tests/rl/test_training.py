@@ -89,6 +89,7 @@ def test_the_written_policy_acts_as_the_learner(robot: Robot, tmp_path: Path, pr
     assert set(load_checkpoint(tmp_path / "policy.pt").learner) == {"actor_state_dict"}
 
 
+@pytest.mark.usefixtures("torch_threads")
 @pytest.mark.parametrize("precision", ["never", "always"])
 def test_the_same_seed_gives_the_same_weights_bit_for_bit(robot: Robot, tmp_path: Path, precision: str) -> None:
     runs, arithmetic = [("a", "seed=1"), ("b", "seed=1"), ("c", "seed=2")], f"ppo.mixed_precision={precision}"

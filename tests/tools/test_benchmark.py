@@ -1,6 +1,5 @@
 """The benchmark measures what it says: every stage goes over the same walk."""
 
-from collections.abc import Callable, Iterator
 from itertools import pairwise
 
 import pytest
@@ -17,13 +16,6 @@ from telebip.tools import benchmark
 from telebip.tools.benchmark import Stages, summary
 from telebip.tools.engines import BareEngine, recorded
 from telebip.tools.measuring import allocated_bytes
-
-
-@pytest.fixture
-def several_threads() -> Iterator[Callable[[int], None]]:
-    before = torch.get_num_threads()
-    yield torch.set_num_threads
-    torch.set_num_threads(before)
 
 
 @pytest.mark.parametrize("backend", ["native", "warp"])
@@ -49,12 +41,9 @@ def test_a_recorded_walk_can_be_gone_over_again(make_env: MakeEnv, backend: str)
             assert torch.equal(value[others], following.memory[name][others]), name
 
 
-@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.usefixtures("torch_threads")
 @pytest.mark.parametrize("precision", ["never", "always"])
-def test_every_stage_takes_the_same_actions(
-    robot: Robot, monkeypatch: pytest.MonkeyPatch, several_threads: Callable[[int], None], precision: str, threads: int
-) -> None:
-    several_threads(threads)
+def test_every_stage_takes_the_same_actions(robot: Robot, monkeypatch: pytest.MonkeyPatch, precision: str) -> None:
     walked: list[Tensor] = []
     step = TelebipEnv.step
 

@@ -30,6 +30,7 @@ def test_both_train_for_as_many_samples_as_asked_for(robot: Robot) -> None:
     assert result["telebip"] != result["stock"]
 
 
+@pytest.mark.usefixtures("torch_threads")
 @pytest.mark.parametrize("precision", ["never", "always"])
 def test_a_racer_learns_what_it_learns_alone(robot: Robot, precision: str) -> None:
     config = load_task("telebip_flat", [*SMALL, f"ppo.mixed_precision={precision}"])
