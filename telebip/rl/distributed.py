@@ -103,5 +103,6 @@ def joined(ranks: Ranks, device: "torch.device") -> Iterator[None]:
     torch.distributed.init_process_group("nccl" if device.type == "cuda" else "gloo", rank=ranks.rank, world_size=ranks.size)
     try:
         yield
+        torch.distributed.barrier()  # nobody leaves while another one still talks to it
     finally:
         torch.distributed.destroy_process_group()

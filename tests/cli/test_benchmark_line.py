@@ -40,6 +40,7 @@ def test_the_table_and_its_json(tmp_path: Path) -> None:
         assert storage < row["bytes_per_env"] < 10_000_000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", ["telebip_slow", "configs/telebip_efficient.yaml"])
 def test_a_policy_of_the_same_kind_walks_where_none_is_named(task: str) -> None:
     text = ran(BENCHMARK, "--task", task, "--num-envs", "4", *TINY)

@@ -147,6 +147,7 @@ def test_a_trained_policy_can_be_played_and_recorded(run_dir: Path) -> None:
     assert record.stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_pictures_are_made_anew(tmp_path: Path) -> None:
     text = ran(GALLERY, "--only", "control_loop.png", "stride.png", "--out", str(tmp_path), run=fresh)
     assert [line.split(":")[0] for line in text.splitlines()] == [f"{tmp_path}/control_loop.png", f"{tmp_path}/stride.png"]
