@@ -94,7 +94,7 @@ class TelebipEnv(VecEnv):
         if self._is_recorded:
             self._before_physics = CudaGraph(self._prepare_step, self.device, self.generator)
             self._after_physics = CudaGraph(self._finish_step, self.device, self.generator)
-        self._draws.draw(self.generator)
+        self._random.draw(self.generator)
         self._events.happen("once", self.view())
         self.sim.refresh_constants(self._everywhere())
         self.reset()
@@ -134,8 +134,8 @@ class TelebipEnv(VecEnv):
         }
         self._events = Events(cfg.events, binder)
         ranges = [cfg.commands.lin_vel_x, cfg.commands.lin_vel_y, cfg.commands.ang_vel_z]
-        self._drawn_commands = binder.draws("commands", {"command": ranges})
-        self._draws = binder.allocate()
+        self._drawn_commands = binder.random("commands", {"command": ranges})
+        self._random = binder.allocate()
         self.state.reset(self._everywhere())  # of what finding the sizes has left
         self.reward_names = tuple(self._rewards)
         self.reward_terms = torch.zeros(len(self._rewards), self.num_envs, device=self.device)  # of the last step
@@ -143,7 +143,7 @@ class TelebipEnv(VecEnv):
 
     def reset(self) -> TensorDict:
         """Start a new episode in every world and return its observation."""
-        self._draws.draw(self.generator)
+        self._random.draw(self.generator)
         self._reset(self._everywhere())
         self.sim.refresh_constants(self._everywhere())
         return self.get_observations()
@@ -202,7 +202,7 @@ class TelebipEnv(VecEnv):
     def _prepare_step(self) -> None:
         """Draw the step's random numbers, and set the joint targets and the push."""
         state, step = self.state, self.view()
-        self._draws.draw(self.generator)
+        self._random.draw(self.generator)
         for group in self.groups.values():
             group.advance()
         self._finite.copy_(self._given.isfinite().all(1))

@@ -278,11 +278,11 @@ def test_switched_off_disturbances_are_exactly_absent(make_env: MakeEnv, robot: 
 def noise_of_a_step(env: TelebipEnv) -> Tensor:
     """Step, and return what the noise adds to the observation."""
     env.step(torch.ones(env.num_envs, 6))
-    noisy, noise = observe(env), env.state.draws.clone()
+    noisy, noise = observe(env), env.state.random.clone()
     assert torch.equal(observe(env), noisy)  # reading is not drawing
-    env.state.draws.zero_()
+    env.state.random.zero_()
     clean = observe(env)
-    env.state.draws.copy_(noise)
+    env.state.random.copy_(noise)
     return noisy - clean
 
 
@@ -521,7 +521,7 @@ def test_a_reset_of_the_state_spares_other_worlds_and_what_lasts(make_env: MakeE
     mask = torch.tensor([True, False, True, False])
     env.state.reset(mask)
     lasting = {"held_wrench_w", "target_command", "command", "command_is_fixed", "reference_heading", "joint_target"}
-    lasting |= {"wrench_w", "draws", "num_steps", "samples"}
+    lasting |= {"wrench_w", "random", "num_steps", "samples"}
     names = dict(env.state.items())
     assert lasting <= names.keys()
     for name, value in names.items():

@@ -65,14 +65,14 @@ class DelayLine:
         self._decimation, self._in_physics_steps = world.decimation, physics_delay[1] > 0
         self._length = -(-(world.decimation * delay[1] + physics_delay[1]) // world.decimation)  # policy steps at most
         ranges = [(float(low), float(high + 1)) for low, high in (delay, physics_delay)]  # of numbers whose floor counts
-        self._draws = binder.draws("actions", {"delay": ranges})
+        self._random = binder.random("actions", {"delay": ranges})
         earlier = {"targets": world.zeros(self._length, world.num_joints), "delay": world.zeros()}
         self._memory = binder.memory("actions", earlier)  # targets relative to the nominal pose, the newest first
 
     def __call__(self, step: Step) -> Tensor:
         """Take the step's `joint_target`, and return the targets that reach the actuators in it, see `Simulator.step`."""
         memory, world, n = self._memory, step.world, self._decimation
-        steps, physics_steps = self._draws["delay"].floor().unbind(1)
+        steps, physics_steps = self._random["delay"].floor().unbind(1)
         torch.where(step.is_new, n * steps + physics_steps, memory["delay"], out=memory["delay"])
         known = torch.cat([(step.env.joint_target - world.nominal)[:, None], memory["targets"]], dim=1)
         substep = torch.arange(n if self._in_physics_steps else 1, device=known.device)

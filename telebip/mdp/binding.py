@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from telebip.mdp.draws import Draws, Ranges
+from telebip.mdp.random_numbers import RandomNumbers, Ranges
 from telebip.mdp.step import Memory, Step
 from telebip.mdp.term import Kind, ObservationGroup, Params, Term, find
 
@@ -57,8 +57,8 @@ class Binder:
         more: list[Any] = []
         if term.memory:
             more.append(self.memory(name, term.memory(world, **keywords)))
-        if term.draws:
-            more.append(self.draws(name, term.draws(world, **keywords)))
+        if term.random:
+            more.append(self.random(name, term.random(world, **keywords)))
         return lambda *arguments: term.function(*arguments, *more, **keywords)
 
     def memory(self, name: str, tensors: Mapping[str, Tensor]) -> Memory:
@@ -66,22 +66,22 @@ class Binder:
         self.step.env.memory[name] = dict(tensors)
         return self.step.env.memory[name]
 
-    def draws(self, name: str, ranges: Ranges) -> dict[str, Tensor]:
+    def random(self, name: str, ranges: Ranges) -> dict[str, Tensor]:
         """Return the random numbers of these ranges: zeros until `allocate` has been called, and drawn in every step after."""
         kept = {part: list(bounds) for part, bounds in ranges.items() if bounds}
         self._ranges |= {f"{name}.{part}": bounds for part, bounds in kept.items()}
         self._given[name] = {part: self.step.world.zeros(len(bounds)) for part, bounds in kept.items()}
         return self._given[name]
 
-    def allocate(self) -> Draws:
+    def allocate(self) -> RandomNumbers:
         """Make room in the state for all random numbers of a step."""
         env, world = self.step.env, self.step.world
-        env.draws = world.zeros(Draws.count(self._ranges))
-        draws = Draws(self._ranges, env.draws)
+        env.random = world.zeros(RandomNumbers.count(self._ranges))
+        numbers = RandomNumbers(self._ranges, env.random)
         for name in self._ranges:
             term, _, part = name.rpartition(".")
-            self._given[term][part] = draws.part(name)
-        return draws
+            self._given[term][part] = numbers.part(name)
+        return numbers
 
 
 class Events:
@@ -111,11 +111,11 @@ def _at_intervals(bound: Bound, name: str, interval: tuple[float, float], binder
     """Return an event that happens in a world whenever the time drawn for it is over."""
     world = binder.step.world
     timer = binder.memory(name, {"time_left": world.zeros()})["time_left"]
-    draws = binder.draws(name, {"interval": [interval]})
+    random = binder.random(name, {"interval": [interval]})
 
     def event(step: Step, mask: Tensor) -> None:
         due = (timer <= 0.0) & ~step.is_new
-        torch.where(due | step.is_new, draws["interval"][:, 0], timer, out=timer)
+        torch.where(due | step.is_new, random["interval"][:, 0], timer, out=timer)
         timer.sub_(world.step_dt)
         bound(step, due & mask)
 

@@ -11,8 +11,8 @@ Ramp = Annotated[tuple[float, float], Quantity("samples", ge=0)]
 """A term's parameter: between which samples it grows from nothing to all of it."""
 
 
-def share(samples: Tensor, between: tuple[float, float]) -> Tensor | float:
-    """Return a share, linear in `samples` (): 0 up to `between[0]` and 1 from `between[1]` on, ().
+def progress(samples: Tensor, between: tuple[float, float]) -> Tensor | float:
+    """Return how far a ramp has come, linear in `samples` (): 0 up to `between[0]` and 1 from `between[1]` on, ().
 
     Both in environment steps of all worlds together, the unit that does not depend on how many worlds there are.
     """

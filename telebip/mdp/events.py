@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from telebip.math import columns, turn
-from telebip.mdp.curriculum import Ramp, share
+from telebip.mdp.curriculum import Ramp, progress
 from telebip.mdp.fields import nominal, rows_of, write
 from telebip.mdp.step import Memory, Step, World
 from telebip.mdp.term import Quantity, event
@@ -21,22 +21,22 @@ from telebip.sim.base import shifted
 Range = Annotated[tuple[float, float], Quantity()]
 Scale = Annotated[tuple[float, float], Quantity(gt=0)]
 Ranges = dict[str, list[tuple[float, float]]]
-Draws = dict[str, Tensor]
+Random = dict[str, Tensor]
 
 
 def _symmetric(size: int, amplitude: float) -> list[tuple[float, float]]:
     return [(-amplitude, amplitude)] * size
 
 
-def _pose_draws(world: World, *, joint_pos: float, heading: float) -> Ranges:
+def _pose_random(world: World, *, joint_pos: float, heading: float) -> Ranges:
     return {"joint_pos": _symmetric(world.num_joints, joint_pos), "heading": _symmetric(1, heading)}
 
 
-@event("reset", draws=_pose_draws, is_disturbance=False)
+@event("reset", random=_pose_random, is_disturbance=False)
 def start_pose(
     step: Step,
     mask: Tensor,
-    draws: Draws,
+    random: Random,
     *,
     joint_pos: Annotated[float, Quantity("rad | m", ge=0)],
     heading: Annotated[float, Quantity("rad", ge=0)],
@@ -47,34 +47,34 @@ def start_pose(
     starts in the ground.
     """
     world, qpos = step.world, step.start_qpos
-    qpos[:, 2] -= (world.foot_lift @ draws["joint_pos"].T).amin(0).clamp(max=0.0)
-    qpos[:, 3:7] = turn(qpos[:, 3:7], draws["heading"][:, 0])
-    qpos[:, step.state.joint_columns] += draws["joint_pos"]
+    qpos[:, 2] -= (world.foot_lift @ random["joint_pos"].T).amin(0).clamp(max=0.0)
+    qpos[:, 3:7] = turn(qpos[:, 3:7], random["heading"][:, 0])
+    qpos[:, step.state.joint_columns] += random["joint_pos"]
 
 
-def _velocity_draws(world: World, *, joint_vel: float, lin_vel: float, ang_vel: float) -> Ranges:
+def _velocity_random(world: World, *, joint_vel: float, lin_vel: float, ang_vel: float) -> Ranges:
     return {
         "trunk": [*_symmetric(2, lin_vel), (0.0, 0.0), *_symmetric(3, ang_vel)],
         "joint_vel": _symmetric(world.num_joints, joint_vel),
     }
 
 
-@event("reset", draws=_velocity_draws, is_disturbance=False)
+@event("reset", random=_velocity_random, is_disturbance=False)
 def start_velocity(
     step: Step,
     mask: Tensor,
-    draws: Draws,
+    random: Random,
     *,
     joint_vel: Annotated[float, Quantity("rad/s | m/s", ge=0)],
     lin_vel: Annotated[float, Quantity("m/s", ge=0)],
     ang_vel: Annotated[float, Quantity("rad/s", ge=0)],
 ) -> None:
     """Start in motion: joints, the trunk's horizontal velocity and its rotation are uniform within these bounds."""
-    step.start_qvel[:, :6] += draws["trunk"]
-    step.start_qvel[:, shifted(step.state.joint_columns)] += draws["joint_vel"]
+    step.start_qvel[:, :6] += random["trunk"]
+    step.start_qvel[:, shifted(step.state.joint_columns)] += random["joint_vel"]
 
 
-def _push_draws(world: World, *, force: float, interval: tuple[float, float], **_) -> Ranges:
+def _push_random(world: World, *, force: float, interval: tuple[float, float], **_) -> Ranges:
     return {"interval": [interval], "push": [(0.0, force), (-math.pi, math.pi)]}
 
 
@@ -83,12 +83,12 @@ def _push_memory(world: World, **_) -> Memory:
     return {"timer": world.zeros(), "time_left": world.zeros(), "force": world.zeros(2)}
 
 
-@event("step", draws=_push_draws, memory=_push_memory)
+@event("step", random=_push_random, memory=_push_memory)
 def push(
     step: Step,
     mask: Tensor,
     memory: Memory,
-    draws: Draws,
+    random: Random,
     *,
     force: Annotated[float, Quantity("N", ge=0)],
     duration: Annotated[float, Quantity("s", gt=0)],
@@ -101,7 +101,7 @@ def push(
         step: the step that begins.
         mask: all worlds.
         memory: the timers.
-        draws: each world's next interval, magnitude and direction.
+        random: each world's next interval, magnitude and direction.
         force: magnitudes are uniform in 0..force [N], in a random direction.
         duration: of a push [s].
         interval: between the starts of two pushes, uniform [s].
@@ -109,46 +109,46 @@ def push(
     """
     timer, time_left = memory["timer"], memory["time_left"]
     start = (timer <= 0.0) & ~step.is_new
-    torch.where(start | step.is_new, draws["interval"][:, 0], timer, out=timer)
+    torch.where(start | step.is_new, random["interval"][:, 0], timer, out=timer)
     timer -= step.world.step_dt
     time_left -= step.world.step_dt
     time_left.masked_fill_(start, duration)
-    magnitude, direction = draws["push"].split(1, dim=1)
-    drawn = share(step.env.samples, ramp) * magnitude * columns(torch.cos(direction), torch.sin(direction))
+    magnitude, direction = random["push"].split(1, dim=1)
+    drawn = progress(step.env.samples, ramp) * magnitude * columns(torch.cos(direction), torch.sin(direction))
     kept = torch.where(start[:, None], drawn, memory["force"])
     memory["force"].copy_(kept.masked_fill(time_left[:, None] < 0.5 * step.world.step_dt, 0.0))
     step.push_force(memory["force"])
 
 
-@event("reset", "once", draws=lambda world, *, range: {"friction": [range]}, fields=lambda **_: ("geom_friction",))
-def friction(step: Step, mask: Tensor, draws: Draws, *, range: Annotated[tuple[float, float], Quantity(gt=0)]) -> None:
+@event("reset", "once", random=lambda world, *, range: {"friction": [range]}, fields=lambda **_: ("geom_friction",))
+def friction(step: Step, mask: Tensor, random: Random, *, range: Annotated[tuple[float, float], Quantity(gt=0)]) -> None:
     """Draw the sliding friction of the ground [-].
 
     The floor needs `priority="1"` in the MJCF, so that its friction wins over the foot's.
     """
     sim = step.world.sim
     value = sim.model_fields["geom_friction"][:, sim.model.geom("floor").id, 0]
-    torch.where(mask, draws["friction"][:, 0].to(value.dtype), value, out=value)
+    torch.where(mask, random["friction"][:, 0].to(value.dtype), value, out=value)
 
 
-@event("reset", "once", draws=lambda world, *, scale, **_: {"mass": [scale]}, fields=lambda **_: ("body_mass", "body_inertia"))
-def mass(step: Step, mask: Tensor, draws: Draws, *, scale: Scale, bodies: list[str] | None = None) -> None:
+@event("reset", "once", random=lambda world, *, scale, **_: {"mass": [scale]}, fields=lambda **_: ("body_mass", "body_inertia"))
+def mass(step: Step, mask: Tensor, random: Random, *, scale: Scale, bodies: list[str] | None = None) -> None:
     """Scale the mass and the inertia of bodies, all by one factor: those named, or the whole robot."""
     for field in ("body_mass", "body_inertia"):
         rows = rows_of(step.world, field, bodies)
         value = nominal(step.world, field, rows)
-        write(step.world, field, rows, draws["mass"].view(-1, *[1] * value.dim()) * value, mask)
+        write(step.world, field, rows, random["mass"].view(-1, *[1] * value.dim()) * value, mask)
 
 
 @event(
     "reset",
     "once",
-    draws=lambda world, *, kp, kv: {"gains": [kp, kv]},
+    random=lambda world, *, kp, kv: {"gains": [kp, kv]},
     fields=lambda **_: ("actuator_gainprm", "actuator_biasprm"),
 )
-def gains(step: Step, mask: Tensor, draws: Draws, *, kp: Scale, kv: Scale) -> None:
+def gains(step: Step, mask: Tensor, random: Random, *, kp: Scale, kv: Scale) -> None:
     """Scale the stiffness kp and the damping kv of all position actuators, each by one factor."""
-    kp_factor, kv_factor = draws["gains"].split(1, dim=1)
+    kp_factor, kv_factor = random["gains"].split(1, dim=1)
     for field, column, factor in (
         ("actuator_gainprm", 0, kp_factor),
         ("actuator_biasprm", 1, kp_factor),
@@ -158,15 +158,15 @@ def gains(step: Step, mask: Tensor, draws: Draws, *, kp: Scale, kv: Scale) -> No
         write(step.world, field, index, factor * nominal(step.world, field, index), mask)
 
 
-def _field_draws(world: World, *, field: str, range: tuple[float, float], names: list[str] | None, **_) -> Ranges:
+def _field_random(world: World, *, field: str, range: tuple[float, float], names: list[str] | None, **_) -> Ranges:
     return {"field": [range] * len(nominal(world, field, rows_of(world, field, names)))}
 
 
-@event("reset", "once", draws=_field_draws, fields=lambda *, field, **_: (field,))
+@event("reset", "once", random=_field_random, fields=lambda *, field, **_: (field,))
 def model_field(
     step: Step,
     mask: Tensor,
-    draws: Draws,
+    random: Random,
     *,
     field: str,
     range: Range,
@@ -182,7 +182,7 @@ def model_field(
     Args:
         step: the step of the reset.
         mask: worlds that draw anew.
-        draws: a number for each row.
+        random: a number for each row.
         field: as in `mujoco.MjModel`: body_mass, dof_damping, dof_armature, body_ipos, geom_friction, ...
         range: of the number.
         operation: what to do with the MJCF's value: scale it, add to it, or set it.
@@ -192,7 +192,7 @@ def model_field(
     rows = rows_of(step.world, field, names)
     index = rows if column is None else (rows, column)
     value = nominal(step.world, field, index)
-    number = draws["field"].view(*draws["field"].shape, *[1] * (value.dim() - 1))
+    number = random["field"].view(*random["field"].shape, *[1] * (value.dim() - 1))
     if operation == "set":
         number = number + torch.zeros_like(value)
     elif operation == "add":
@@ -202,20 +202,20 @@ def model_field(
     write(step.world, field, index, number, mask)
 
 
-def _kick_draws(world: World, *, lin_vel: float, ang_vel: float) -> Ranges:
+def _kick_random(world: World, *, lin_vel: float, ang_vel: float) -> Ranges:
     return {"kick": _symmetric(3, lin_vel) + _symmetric(3, ang_vel)}
 
 
-@event("interval", draws=_kick_draws)
+@event("interval", random=_kick_random)
 def kick(
     step: Step,
     mask: Tensor,
-    draws: Draws,
+    random: Random,
     *,
     lin_vel: Annotated[float, Quantity("m/s", ge=0)],
     ang_vel: Annotated[float, Quantity("rad/s", ge=0)],
 ) -> None:
     """Change the trunk's velocity at once, about all six axes, uniform within these bounds."""
     live = step.world.sim.memory["qvel"]
-    live[:, :6] += draws["kick"].masked_fill(~mask[:, None], 0.0)
+    live[:, :6] += random["kick"].masked_fill(~mask[:, None], 0.0)
     step.state.qvel.copy_(live)

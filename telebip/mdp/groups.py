@@ -53,7 +53,7 @@ class Group:
         self._has_noise = any(part.noise for part in self.parts)
         noise = [(-part.noise, part.noise) for part in self.parts for _ in range(part.size)]
         late = [(cfg.delay[0], cfg.delay[1] + 1)] if cfg.delay[1] else []
-        self._draws = binder.draws(section, {"noise": noise if self._has_noise else [], "delay": late})
+        self._random = binder.random(section, {"noise": noise if self._has_noise else [], "delay": late})
         kept = cfg.history + cfg.delay[1]
         frames = {"frames": world.zeros(kept * self.frame_size), "age": world.zeros()}
         self._memory = binder.memory(section, frames) if kept > 1 else None
@@ -72,7 +72,7 @@ class Group:
         """Return what is seen now, (num_envs, size); seen twice in a step, it is the same."""
         frame = columns(*(term(step) for term in self._terms))
         if self._has_noise:
-            frame += self._draws["noise"]
+            frame += self._random["noise"]
         if not self._memory:
             return frame.contiguous()  # by rows, as everyone expects
         frames, size = self._memory["frames"], self.frame_size
@@ -82,7 +82,7 @@ class Group:
         if not self._delay[1]:
             return frames.contiguous()
         age = self._memory["age"]
-        torch.where(step.is_new, self._draws["delay"][:, 0].floor(), age, out=age)
+        torch.where(step.is_new, self._random["delay"][:, 0].floor(), age, out=age)
         index = age.long()[:, None] + torch.arange(self.history, device=frame.device)
         seen = frames.unflatten(1, (kept, size)).gather(1, index[:, :, None].expand(-1, -1, size))
         return seen.flatten(1).contiguous()

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from telebip.math import columns, norm
-from telebip.mdp.curriculum import Ramp, share
+from telebip.mdp.curriculum import Ramp, progress
 from telebip.mdp.gait import window_weights
 from telebip.mdp.step import Memory, Step, World
 from telebip.mdp.term import Quantity, reward
@@ -110,7 +110,7 @@ def energy(step: Step, *, k_energy: Annotated[float, Quantity("s/m", le=0)], ram
     The power over the weight is the speed at which a cost of transport of 1 would be paid for: cost of transport times speed.
     Not in the article. From the first sample on it teaches a robot that cannot walk yet to hold still, so it is ramped up.
     """
-    return share(step.env.samples, ramp) * (k_energy / step.world.weight) * step.state.joint_power.sum(1)
+    return progress(step.env.samples, ramp) * (k_energy / step.world.weight) * step.state.joint_power.sum(1)
 
 
 @reward

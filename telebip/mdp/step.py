@@ -76,14 +76,14 @@ class EnvState:
     reference_heading: Tensor = lasting()  # starts at the robot's own, turns with the commanded yaw rate [rad], (num_envs,)
     joint_target: Tensor = lasting()  # of the last step [rad | m], (num_envs, num_joints)
     wrench_w: Tensor = lasting()  # on the trunk's centre of mass in the last step, world frame [N, N m], (num_envs, 6)
-    draws: Tensor = lasting()  # the step's random numbers, (num_envs, numbers)
+    random: Tensor = lasting()  # the step's random numbers, (num_envs, numbers)
     num_steps: Tensor = lasting()  # since the worlds were made, () long
     samples: Tensor = lasting()  # of the training so far, where the curriculum stands; infinite where it is complete, ()
     memory: dict[str, Memory] = field(default_factory=dict)  # of each term: "rewards.foot", say
 
     @staticmethod
     def zeros(world: World) -> "EnvState":
-        """Allocate it, for worlds that have not begun; `memory` and `draws` come with the terms, see `telebip.mdp.binding`."""
+        """Allocate it, for worlds that have not begun; `memory` and `random` come with the terms, see `telebip.mdp.binding`."""
         device = world.device
         return EnvState(
             episode_length=torch.zeros(world.num_envs, dtype=torch.long, device=device),
@@ -97,7 +97,7 @@ class EnvState:
             reference_heading=world.zeros(),
             joint_target=world.zeros(world.num_joints),
             wrench_w=world.zeros(6),
-            draws=world.zeros(0),
+            random=world.zeros(0),
             num_steps=torch.zeros((), dtype=torch.long, device=device),
             samples=torch.full((), torch.inf, device=device),
         )

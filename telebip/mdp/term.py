@@ -4,13 +4,13 @@
     def torque(step: Step, *, k: Annotated[float, Quantity(le=0)]) -> Tensor: ...
 
 The keyword-only parameters are the term's configuration: their annotations hold type, unit and bounds, and YAML gives the
-values. What a term remembers from step to step it declares as `memory`, and the random numbers that it needs as `draws`; both
+values. What a term remembers from step to step it declares as `memory`, and the random numbers that it needs as `random`; both
 are functions of a `World` and of the term's parameters, and the term is called with what they made:
 
-    term(step, [mask of an event], [memory], [draws], **parameters)
+    term(step, [mask of an event], [memory], [random], **parameters)
 
 `memory` returns a dictionary of tensors, which live in `EnvState`: they are reset to zero with their world, saved and restored.
-`draws` returns a dictionary of lists of (low, high): one uniform number per world for each, drawn anew in every step.
+`random` returns a dictionary of lists of (low, high): one uniform number per world for each, drawn anew in every step.
 """
 
 import inspect
@@ -65,7 +65,7 @@ class Term:
     kind: Kind
     function: Callable[..., Any]
     memory: Callable[..., Mapping[str, Any]] | None = None  # (world, **parameters) -> tensors
-    draws: Callable[..., Mapping[str, list[tuple[float, float]]]] | None = None  # (world, **parameters) -> ranges
+    random: Callable[..., Mapping[str, list[tuple[float, float]]]] | None = None  # (world, **parameters) -> ranges
     unit: str = ""  # of an observation
     mirror: Mirror | Callable[..., Mirror] = "none"  # of an observation, or (**parameters) -> that
     sensors: Callable[..., tuple[str, ...]] | None = None  # of an observation: (**parameters) -> sensors of the MJCF
@@ -174,7 +174,7 @@ def event(*when: When, **about: Any) -> Callable[[Callable[..., Any]], Callable[
         when: "reset", in the worlds that begin an episode; "once", in all worlds, as they are made; "interval", in the worlds
             whose time has come, every `interval` [s] of a range; "step", in all worlds, before each step. With several, the
             YAML's `when` chooses.
-        about: `memory`, `draws`, `fields` and `is_disturbance` of `Term`.
+        about: `memory`, `random`, `fields` and `is_disturbance` of `Term`.
     """
     return lambda function: _enter("event", function, {"when": when, "is_disturbance": True, **about})
 

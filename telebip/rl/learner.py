@@ -7,7 +7,7 @@ from rsl_rl.storage import RolloutStorage
 
 from telebip.config.schema import PpoConfig
 from telebip.errors import UserError
-from telebip.mdp.curriculum import share
+from telebip.mdp.curriculum import progress
 from telebip.rl.distributed import Ranks
 from telebip.rl.networks import actor_cfg, critic_cfg, network_class
 from telebip.rl.ppo import FastPPO
@@ -72,5 +72,5 @@ def set_min_std(learner: PPO, ppo: PpoConfig, samples: int) -> None:
 
 def min_std(ppo: PpoConfig, samples: int) -> float:
     """Return the floor of the action's standard deviation after `samples`: from `min_std` to `final_min_std`, geometrically."""
-    grown = float(share(torch.tensor(samples, dtype=torch.float64), ppo.min_std_ramp))
+    grown = float(progress(torch.tensor(samples, dtype=torch.float64), ppo.min_std_ramp))
     return ppo.min_std * (ppo.final_min_std / ppo.min_std) ** grown

@@ -5,11 +5,11 @@ import math
 import pytest
 import torch
 
-from telebip.mdp.curriculum import share
+from telebip.mdp.curriculum import progress
 
 
 def share_at(samples: float, between: tuple[float, float]) -> float:
-    return float(share(torch.tensor(samples), between))
+    return float(progress(torch.tensor(samples), between))
 
 
 @pytest.mark.parametrize(

@@ -225,7 +225,7 @@ def test_any_field_of_the_model_is_changed_row_by_row(robot: Robot, operation: s
     (damping,) = changed(step, "joints", **params, names=["right_knee", "left_hip_roll"], column=None).values()
     rows = [int(robot.model.joint(name).dofadr[0]) for name in ("right_knee", "left_hip_roll")]
     old = nominal(step, "dof_damping")
-    drawn = step.env.draws[HALF].to(damping.dtype)
+    drawn = step.env.random[HALF].to(damping.dtype)
     assert drawn.shape == (4, 2)
     assert not torch.equal(drawn[:, 0], drawn[:, 1])  # a number for each
     torch.testing.assert_close(damping[:, rows], apply(old[rows], drawn))

@@ -7,8 +7,8 @@ from torch import Tensor
 
 from telebip.errors import UserError
 from telebip.mdp.binding import Binder
-from telebip.mdp.draws import Draws
 from telebip.mdp.groups import Group
+from telebip.mdp.random_numbers import RandomNumbers
 from telebip.mdp.step import Step, World
 from telebip.mdp.term import TERMS, ObservationGroup, observation
 from telebip.robot import Robot
@@ -17,7 +17,7 @@ CLOCK = {"base_height": {"noise": 0.0}, "command": {"noise": 0.0}}
 """What a test sets to the number of the step: 1 + 3 numbers."""
 
 
-def grouped(step: Step, group: ObservationGroup) -> tuple[Group, Draws]:
+def grouped(step: Step, group: ObservationGroup) -> tuple[Group, RandomNumbers]:
     binder = Binder(step)
     return Group("policy", group, binder), binder.allocate()
 
@@ -98,7 +98,7 @@ def test_a_group_without_noise_has_none_whatever_its_terms_say(robot: Robot) -> 
     draws.draw(torch.Generator().manual_seed(0))
     torch.testing.assert_close(runtime.observe(step), torch.full((4, 1), 0.66))
     assert [part.noise for part in runtime.parts] == [0.0]
-    assert step.env.draws.shape == (4, 0)
+    assert step.env.random.shape == (4, 0)
 
 
 def test_parts_have_names_for_their_numbers(robot: Robot) -> None:
@@ -141,9 +141,9 @@ def test_a_term_may_remember_and_draw(robot: Robot, own_terms: None) -> None:
     def constant(world: World, *, amplitude: float) -> dict[str, Tensor]:
         return {"bias": world.zeros(2)}
 
-    @observation(memory=constant, draws=lambda world, *, amplitude: {"bias": [(-amplitude, amplitude)] * 2})
-    def biased(step: Step, memory: dict[str, Tensor], draws: dict[str, Tensor], *, amplitude: float) -> Tensor:
-        torch.where(step.is_new[:, None], draws["bias"], memory["bias"], out=memory["bias"])
+    @observation(memory=constant, random=lambda world, *, amplitude: {"bias": [(-amplitude, amplitude)] * 2})
+    def biased(step: Step, memory: dict[str, Tensor], random: dict[str, Tensor], *, amplitude: float) -> Tensor:
+        torch.where(step.is_new[:, None], random["bias"], memory["bias"], out=memory["bias"])
         return memory["bias"] + step.state.base_pos[:, 2:3]
 
     step = make_step(robot, 64)

@@ -9,7 +9,7 @@ Ranges = Mapping[str, Sequence[tuple[float, float]]]
 """By name, the bounds of each number that a world draws."""
 
 
-class Draws:
+class RandomNumbers:
     """Numbers, uniform in their ranges, for all worlds: `part(name)` is (num_envs, size), and `draw` writes new ones to it.
 
     Every step draws all of them, for every world, whether it needs them or not: one call instead of dozens, and a fault in one

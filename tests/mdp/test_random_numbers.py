@@ -7,30 +7,30 @@ from torch import Tensor
 
 from telebip.config import TaskConfig, load_task
 from telebip.mdp.binding import Binder, Events
-from telebip.mdp.draws import Draws
 from telebip.mdp.groups import Group
+from telebip.mdp.random_numbers import RandomNumbers
 from telebip.robot import Robot
 
 RANGES = {"first": [(-1.0, 3.0)], "second": [(0.0, 0.0), (5.0, 6.0)]}
 
 
 def draw(ranges: dict[str, list[tuple[float, float]]], num_envs: int, seed: int = 0) -> dict[str, Tensor]:
-    draws = Draws(ranges, torch.zeros(num_envs, Draws.count(ranges)))
+    draws = RandomNumbers(ranges, torch.zeros(num_envs, RandomNumbers.count(ranges)))
     draws.draw(torch.Generator().manual_seed(seed))
     return {name: draws.part(name).clone() for name in ranges}
 
 
-def numbers_of(robot: Robot, cfg: TaskConfig, num_envs: int, seed: int = 0) -> tuple[dict[str, Tensor], Draws]:
+def numbers_of(robot: Robot, cfg: TaskConfig, num_envs: int, seed: int = 0) -> tuple[dict[str, Tensor], RandomNumbers]:
     """What the events and the observations of a task draw, by name, and all of its draws."""
     step = make_step(robot, num_envs, fields=("geom_friction",))
     binder = Binder(step)
     Events(cfg.events, binder)
     Group("policy", cfg.observations["policy"], binder)
     commands = cfg.commands
-    binder.draws("commands", {"command": [commands.lin_vel_x, commands.lin_vel_y, commands.ang_vel_z]})
+    binder.random("commands", {"command": [commands.lin_vel_x, commands.lin_vel_y, commands.ang_vel_z]})
     draws = binder.allocate()
     draws.draw(torch.Generator().manual_seed(seed))
-    assert step.env.draws.shape == (num_envs, sum(part.shape[1] for part in draws._parts.values()))
+    assert step.env.random.shape == (num_envs, sum(part.shape[1] for part in draws._parts.values()))
     return draws._parts, draws
 
 
@@ -56,7 +56,7 @@ def test_nothing_to_draw_is_nothing_drawn() -> None:
 
 def test_the_lowest_and_the_highest_number_are_in_range() -> None:
     """The high bound is excluded, so that the floor of a number below N + 1 is at most N."""
-    draws = Draws({"delay": [(0.0, 4.0)]}, torch.zeros(4, 1))
+    draws = RandomNumbers({"delay": [(0.0, 4.0)]}, torch.zeros(4, 1))
     draws._numbers.copy_(torch.tensor([[-(2**15)], [2**15 - 1], [0], [-1]]))
     draws._values.copy_(draws._numbers).mul_(draws._spacing).add_(draws._middle)
     assert draws.part("delay").floor()[:, 0].tolist() == [0.0, 3.0, 2.0, 1.0]
