@@ -22,6 +22,7 @@ from telebip.cli import evaluate, export, play, train
 from telebip.env import TelebipEnv
 from telebip.errors import UserError
 from telebip.mdp.term import TERMS
+from telebip.rl import learner
 from telebip.rl.checkpoint import load_checkpoint
 from telebip.rl.curve import read_curve
 from telebip.rl.onnx import OnnxPolicy
@@ -144,6 +145,16 @@ def test_a_name_that_is_taken_is_refused() -> None:
         @reward
         def cmd(step: Step) -> torch.Tensor:
             return step.state.base_pos[:, 2]
+
+
+def test_an_algorithm_of_ones_own_is_one_class_and_one_line_of_yaml(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(learner, "ALGORITHMS", dict(learner.ALGORITHMS))
+    exec(blocks("python")[1].replace("from telebip.rl.learner import ALGORITHMS", ""), {"ALGORITHMS": learner.ALGORITHMS})
+    (text,) = (block for block in blocks("yaml") if "algorithm" in block)
+    run_dir = train_in(tmp_path, write_task(tmp_path, text))
+    assert load_checkpoint(run_dir).config.ppo.algorithm == "no_entropy"
+    with pytest.raises(UserError, match=r"ppo.algorithm: unknown algorithm 'no_entrpy'; did you mean 'no_entropy'\?"):
+        train.main(["--task", "telebip_flat", "--log-dir", str(tmp_path), *TINY, "ppo.algorithm=no_entrpy"])
 
 
 # Groups, history, delays
@@ -290,7 +301,7 @@ def test_symmetry_is_refused_where_there_is_none(tmp_path: Path, robot: Robot) -
 
 def test_the_pages_python_makes_worlds(capsys: pytest.CaptureFixture[str]) -> None:
     names: dict = {}
-    exec(blocks("python")[1], names)
+    exec(blocks("python")[2], names)
     assert names["env"].num_envs == 16
     assert names["env"].cfg.rewards["energy"]["k_energy"] == -0.3
 

@@ -63,6 +63,7 @@ class CommandsConfig:
 class PpoConfig:
     """The learning."""
 
+    algorithm: str  # of `telebip.rl.learner.ALGORITHMS`
     max_iterations: Annotated[int, Quantity(ge=1)]
     num_steps_per_env: Annotated[int, Quantity(ge=1)]
     num_learning_epochs: Annotated[int, Quantity(ge=1)]

@@ -6,13 +6,16 @@ from rsl_rl.env import VecEnv
 from rsl_rl.storage import RolloutStorage
 
 from telebip.config.schema import PpoConfig
-from telebip.errors import UserError
+from telebip.errors import UserError, nearest
 from telebip.mdp.curriculum import progress
 from telebip.rl.distributed import Ranks
 from telebip.rl.networks import actor_cfg, critic_cfg, network_class
 from telebip.rl.ppo import FastPPO
 
-ALGORITHM = (
+ALGORITHMS: dict[str, type[PPO]] = {"fast_ppo": FastPPO, "ppo": PPO}
+"""What `ppo.algorithm` may name; add a subclass of your own here (docs/extending.md)."""
+
+FIELDS = (
     *("num_learning_epochs", "num_mini_batches", "learning_rate", "schedule", "desired_kl", "gamma", "lam", "clip_param"),
     *("value_loss_coef", "entropy_coef", "max_grad_norm"),
 )
@@ -24,7 +27,7 @@ def make_learner(
     ppo: PpoConfig,
     obs_groups: dict[str, list[str]],
     ranks: Ranks,
-    algorithm: type[PPO] = FastPPO,
+    algorithm: type[PPO] | None = None,
 ) -> PPO:
     """Return a learner with new networks, which draw their weights from torch's generator, the same in every process.
 
@@ -33,21 +36,23 @@ def make_learner(
         ppo: the learning.
         obs_groups: which groups of observations actor and critic see.
         ranks: the processes that learn together.
-        algorithm: what learns.
+        algorithm: what learns; the one that `ppo.algorithm` names if not given.
 
     Raises:
-        UserError: an iteration has too few samples.
+        UserError: an iteration has too few samples, or there is no such algorithm.
     """
     _check_batch(env.num_envs, ppo)
+    if ppo.algorithm not in ALGORITHMS:
+        raise UserError(f"ppo.algorithm: unknown algorithm '{ppo.algorithm}'; {nearest(ppo.algorithm, ALGORITHMS)}")
     obs, device = env.get_observations(), str(env.device)
     network = network_class(ppo.mixed_precision, torch.device(device))
-    learner = algorithm(
+    learner = (algorithm or ALGORITHMS[ppo.algorithm])(
         network(obs, obs_groups, "actor", env.num_actions, **actor_cfg(ppo)),
         network(obs, obs_groups, "critic", 1, **critic_cfg(ppo)),
         RolloutStorage("rl", env.num_envs, ppo.num_steps_per_env, obs, [env.num_actions], device),
         device=device,
         multi_gpu_cfg=ranks.multi_gpu_cfg,
-        **{name: getattr(ppo, name) for name in ALGORITHM},
+        **{name: getattr(ppo, name) for name in FIELDS},
     )
     if ranks.size > 1:
         learner.broadcast_parameters()

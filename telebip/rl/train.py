@@ -24,7 +24,6 @@ from telebip.rl.layout import obs_groups, seen
 from telebip.rl.learner import make_learner, set_min_std
 from telebip.rl.log import EpisodeStatistics, RunLog
 from telebip.rl.networks import arithmetic
-from telebip.rl.ppo import FastPPO
 from telebip.rl.process import random_state, set_random_state
 from telebip.rl.resume import load_learner, require_complete, require_same
 from telebip.rl.saving import Saver
@@ -34,7 +33,7 @@ from telebip.rl.symmetry import SymmetricEnv, joint_mirror
 class Trainer:
     """Trains one policy in one run folder."""
 
-    algorithm: type[PPO] = FastPPO
+    algorithm: type[PPO] | None = None  # None: the one that `ppo.algorithm` names
 
     def __init__(
         self,
