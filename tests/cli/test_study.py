@@ -138,6 +138,7 @@ def test_the_toy_study_keeps_apart_from_the_real_one() -> None:
     assert (toy.out, toy.runs) == ("runs/study_quick/results", "runs/study_quick")
 
 
+@pytest.mark.slow
 def test_the_study_from_two_seeds_reports_both(tmp_path: Path) -> None:
     where = ("--quick", "--device", "cpu", "--out", str(tmp_path / "out"), "--runs", str(tmp_path / "runs"))
     ran(REPRODUCE, *where, "--only", "period_06", "--seeds", "2")

@@ -48,6 +48,7 @@ def test_it_walks(straight: dict[str, Rollout], name: str, speed: float) -> None
     assert summary.gait_period == pytest.approx(2.0 * load_controller(name).step_time, abs=0.02)
 
 
+@pytest.mark.slow
 @NAMES
 def test_it_walks_at_the_rate_of_the_physics(make_env: MakeEnv, name: str) -> None:
     env = make_env("sim.decimation=1", calm=True, estimate=True)
@@ -64,6 +65,7 @@ def heading(rollout: Rollout) -> np.ndarray:
     return angle - angle[0]
 
 
+@pytest.mark.slow
 @NAMES
 def test_it_walks_sideways_and_turns(make_env: MakeEnv, name: str) -> None:
     sideways = summarise(walk(make_env(calm=True, estimate=True), name, (0.3, 0.1, 0.0), 6.0), skip=3.0)

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 
 from telebip.config import load_task
 from telebip.env import TelebipEnv
-from telebip.rl.learner import ALGORITHM
+from telebip.rl.learner import FIELDS
 from telebip.rl.networks import Gaussian
 from telebip.rl.ppo import FastPPO
 from telebip.rl.train import Trainer
@@ -41,7 +41,7 @@ def rollout(robot: Robot, *overrides: str) -> tuple[Trainer, torch.Tensor]:
 
 def stock_copy(learner: PPO) -> PPO:
     """Return rsl-rl's PPO with the learner's weights, optimiser and rollout."""
-    settings: dict[str, Any] = {name: getattr(learner, name) for name in ALGORITHM}
+    settings: dict[str, Any] = {name: getattr(learner, name) for name in FIELDS}
     stock = PPO(copy.deepcopy(learner.actor), copy.deepcopy(learner.critic), copy.deepcopy(learner.storage), **settings)
     state = copy.deepcopy(learner.optimizer.state_dict())
     for group in state["param_groups"]:
