@@ -259,7 +259,7 @@ def test_the_pages_randomisation_differs_between_worlds_and_trains(tmp_path: Pat
 # Robots with another number of joints
 
 
-@pytest.mark.parametrize(("name", "joints"), [("ten_joints", 10), ("four_joints", 4)])
+@pytest.mark.parametrize(("name", "joints"), [("ten_joints", 10), pytest.param("four_joints", 4, marks=pytest.mark.slow)])
 def test_a_robot_with_another_number_of_joints_goes_through_everything(
     tmp_path: Path, name: str, joints: int, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -84,6 +84,7 @@ def test_its_feet_take_turns(robot: Robot) -> None:
     assert np.corrcoef(feet[12:, :, 0].ravel(), shifted[12:].ravel())[0, 1] > 0.5
 
 
+@pytest.mark.slow
 def test_it_walks_on_the_other_engine_too(robot: Robot) -> None:
     summary = summarise(walk(robot, 0.7, worlds=4, seconds=6.0, backend="warp"), skip=3.0)
     assert summary.falls == 0

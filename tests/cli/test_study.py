@@ -109,6 +109,7 @@ def test_the_study_at_toy_size_goes_on_where_it_stopped(tmp_path: Path) -> None:
     assert results.stat().st_mtime_ns == written
 
 
+@pytest.mark.slow
 def test_results_that_lack_something_are_measured_again_or_named(tmp_path: Path) -> None:
     where = ("--quick", "--device", "cpu", "--out", str(tmp_path), "--runs", str(tmp_path / "runs"), "--only", "dcm")
     older = {"schema": "telebip-results-1", "label": "older", "push": None, "tracking": [{"command_mps": 0.5}]}
