@@ -19,6 +19,11 @@ def columns(*parts: Tensor) -> Tensor:
     return torch.cat([part.reshape(len(part), -1).T for part in parts]).T
 
 
+def over(mask: Tensor, values: Tensor) -> Tensor:
+    """Return `mask` (num_envs,) with as many dimensions as `values` (num_envs, ...), to choose between its rows."""
+    return mask.view(-1, *[1] * (values.dim() - 1))
+
+
 def norm(vec: Tensor) -> Tensor:
     """Return the Euclidean norm of `vec` (..., n), (...); `vector_norm` takes thirty times as long on columns."""
     return vec.square().sum(-1).sqrt()

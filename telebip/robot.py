@@ -5,6 +5,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -105,10 +106,10 @@ def load_robot(path: str | Path) -> Robot:
         model = mujoco.MjModel.from_xml_path(str(file))
     except ValueError as error:
         raise UserError(f"{path}: {error}") from error
-    trunk = _id(model, "body", TRUNK, path)
-    floor = _id(model, "geom", FLOOR, path)
-    sensors = [_id(model, "sensor", name, path) for name in FOOT_SENSORS]
-    home = model.key(_id(model, "key", KEYFRAME, path)).qpos.copy()
+    trunk = part(model, "body", TRUNK, path).id
+    floor = part(model, "geom", FLOOR, path).id
+    sensors = [part(model, "sensor", name, path).id for name in FOOT_SENSORS]
+    home = part(model, "key", KEYFRAME, path).qpos.copy()
     _check_bodies(model, trunk, sensors, path)
     _check_actuators(model, path)
     joints = model.actuator_trnid[:, 0]
@@ -178,13 +179,17 @@ def _is_position(model: mujoco.MjModel, i: int) -> bool:
     return is_linear and 0 < model.actuator_gainprm[i, 0] == -model.actuator_biasprm[i, 1]
 
 
-def _id(model: mujoco.MjModel, kind: str, name: str, path: str | Path) -> int:
-    """Return the id of the `kind` (body, geom, sensor, key) of this name."""
+def part(model: mujoco.MjModel, kind: str, name: str, path: str | Path, condition: str = "") -> Any:
+    """Return MuJoCo's view of the `kind` (body, joint, geom, sensor, key, ...) of this name.
+
+    Raises:
+        UserError: there is none that meets the `condition` for being in the model, as " moves or collides".
+    """
     try:
-        return getattr(model, kind)(name).id
+        return getattr(model, kind)(name)
     except KeyError as error:  # MuJoCo lists the valid names
         valid = str(error.args[0]).partition("Valid names: ")[2]
-        raise UserError(f"{path}: no {kind} named '{name}'; valid: {valid.strip('[]') or 'none'}") from error
+        raise UserError(f"{path}: no {kind} named '{name}'{condition}; valid: {valid.strip('[]') or 'none'}") from error
 
 
 def _columns(columns: list[int]) -> slice | list[int]:

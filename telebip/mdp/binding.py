@@ -109,14 +109,10 @@ class Events:
 
 def _at_intervals(bound: Bound, name: str, interval: tuple[float, float], binder: Binder) -> Bound:
     """Return an event that happens in a world whenever the time drawn for it is over."""
-    world = binder.step.world
-    timer = binder.memory(name, {"time_left": world.zeros()})["time_left"]
+    timer = binder.memory(name, {"time_left": binder.step.world.zeros()})["time_left"]
     random = binder.random(name, {"interval": [interval]})
 
     def event(step: Step, mask: Tensor) -> None:
-        due = (timer <= 0.0) & ~step.is_new
-        torch.where(due | step.is_new, random["interval"][:, 0], timer, out=timer)
-        timer.sub_(world.step_dt)
-        bound(step, due & mask)
+        bound(step, step.is_due(timer, random["interval"][:, 0]) & mask)
 
     return event

@@ -16,6 +16,7 @@ from telebip.mdp.curriculum import Ramp, progress
 from telebip.mdp.fields import nominal, rows_of, write
 from telebip.mdp.step import Memory, Step, World
 from telebip.mdp.term import Quantity, event
+from telebip.robot import FLOOR
 from telebip.sim.base import shifted
 
 Range = Annotated[tuple[float, float], Quantity()]
@@ -107,10 +108,7 @@ def push(
         interval: between the starts of two pushes, uniform [s].
         ramp: samples between which forces grow from nothing to all of it.
     """
-    timer, time_left = memory["timer"], memory["time_left"]
-    start = (timer <= 0.0) & ~step.is_new
-    torch.where(start | step.is_new, random["interval"][:, 0], timer, out=timer)
-    timer -= step.world.step_dt
+    start, time_left = step.is_due(memory["timer"], random["interval"][:, 0]), memory["time_left"]
     time_left -= step.world.step_dt
     time_left.masked_fill_(start, duration)
     magnitude, direction = random["push"].split(1, dim=1)
@@ -127,7 +125,7 @@ def friction(step: Step, mask: Tensor, random: Random, *, range: Annotated[tuple
     The floor needs `priority="1"` in the MJCF, so that its friction wins over the foot's.
     """
     sim = step.world.sim
-    value = sim.model_fields["geom_friction"][:, sim.model.geom("floor").id, 0]
+    value = sim.model_fields["geom_friction"][:, sim.model.geom(FLOOR).id, 0]
     torch.where(mask, random["friction"][:, 0].to(value.dtype), value, out=value)
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from telebip.math import over
 from telebip.sim.base import ENGINE_FAULTS
 
 KINDS = ("non_finite_action", "non_finite_state", *ENGINE_FAULTS)
@@ -44,7 +45,7 @@ class FaultRecorder:
                 with torch.inference_mode(False):  # it outlives the caller's mode
                     self._records[name] = torch.zeros_like(rows)
             kept = self._records[name]
-            kept.copy_(torch.where(new.view(-1, *[1] * (rows.dim() - 1)), rows, kept))
+            kept.copy_(torch.where(over(new, rows), rows, kept))
         self._seen |= new
 
     def take(self) -> dict[str, dict[str, Any]]:

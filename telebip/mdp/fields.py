@@ -7,7 +7,9 @@ import torch
 from torch import Tensor
 
 from telebip.errors import UserError
+from telebip.math import over
 from telebip.mdp.step import World
+from telebip.robot import part
 
 KINDS = {"body": "body", "geom": "geom", "jnt": "joint", "dof": "joint", "actuator": "actuator", "site": "site"}
 """What the first part of a field's name says that its rows are."""
@@ -29,12 +31,8 @@ def rows_of(world: World, field: str, names: list[str] | None) -> slice | Tensor
         raise UserError(f"rows of field '{field}' have no names; leave out `names`")
     found = []
     for name in names:
-        try:
-            part = getattr(world.sim.model, kind)(name)
-        except KeyError as error:  # MuJoCo lists the valid names
-            valid = str(error.args[0]).partition("Valid names: ")[2].strip("[]")
-            raise UserError(f"{world.robot.path}: no {kind} named '{name}' moves or collides; valid: {valid}") from error
-        found.append(int(part.dofadr[0]) if field.startswith("dof_") else part.id)
+        named = part(world.sim.model, kind, name, world.robot.path, " moves or collides")
+        found.append(int(named.dofadr[0]) if field.startswith("dof_") else named.id)
     return _on(world.device, tuple(found))
 
 
@@ -54,4 +52,4 @@ def write(world: World, field: str, index: Index, value: Tensor, mask: Tensor) -
     live: Any = world.sim.model_fields[field]
     at = (slice(None), *index) if isinstance(index, tuple) else (slice(None), index)
     kept = live[at]
-    live[at] = torch.where(mask.view(-1, *[1] * (kept.dim() - 1)), value.to(kept.dtype), kept)
+    live[at] = torch.where(over(mask, kept), value.to(kept.dtype), kept)

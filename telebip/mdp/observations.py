@@ -10,6 +10,7 @@ from torch import Tensor
 
 from telebip.mdp.step import Step
 from telebip.mdp.term import observation
+from telebip.robot import FLOOR
 
 
 @observation(unit="rad | m, relative to the nominal pose", mirror="joints")
@@ -75,7 +76,7 @@ def foot_force(step: Step) -> Tensor:
 @observation(unit="sliding friction coefficient of the ground", mirror="same")
 def friction(step: Step) -> Tensor:
     """Sliding friction of the ground [-], (num_envs, 1); the MJCF's where no event changes it."""
-    floor = step.world.sim.model.geom("floor").id
+    floor = step.world.sim.model.geom(FLOOR).id
     field = step.world.sim.model_fields.get("geom_friction")
     if field is None:
         return step.world.zeros(1) + float(step.world.sim.model.geom_friction[floor, 0])

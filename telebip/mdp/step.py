@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from telebip.math import rotate_inverse, turn, yaw, zeros
+from telebip.math import over, rotate_inverse, turn, yaw, zeros
 from telebip.mdp.gait import phase_signals
 from telebip.robot import Robot
 from telebip.sim.base import SimState, Simulator
@@ -125,7 +125,7 @@ class EnvState:
         """Set to zero what does not outlast an episode, in the worlds where `mask` (num_envs,) holds."""
         own = [getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "memory" and "lasting" not in f.metadata]
         for value in (*own, *(value for memory in self.memory.values() for value in memory.values())):
-            value.masked_fill_(mask.view(-1, *[1] * (value.dim() - 1)), 0)
+            value.masked_fill_(over(mask, value), 0)
 
 
 class Step:
@@ -212,6 +212,16 @@ class Step:
         """
         quat = turn(self.state.base_quat, -self.env.reference_heading)
         return torch.where(quat[:, :1] < 0.0, -quat, quat)
+
+    def is_due(self, timer: Tensor, interval: Tensor) -> Tensor:
+        """Let a step pass on a timer (num_envs,), a term's memory, and return where its time was over, bool, (num_envs,).
+
+        There, and where an episode begins, it starts anew from `interval` (num_envs,) [s].
+        """
+        due = (timer <= 0.0) & ~self.is_new
+        torch.where(due | self.is_new, interval, timer, out=timer)
+        timer -= self.world.step_dt
+        return due
 
     def to_body(self, vector_w: Tensor) -> Tensor:
         """Express vectors (num_envs, 3) of the world frame in the trunk's."""

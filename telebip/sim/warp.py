@@ -13,6 +13,7 @@ import warp as wp
 from torch import Tensor
 
 from telebip.errors import UserError
+from telebip.math import over
 from telebip.robot import FOOT_SENSORS, TRUNK, Robot
 from telebip.sim.base import ENGINE_FAULTS, MEANS, Backend, SimState, derives, state_fields
 
@@ -143,9 +144,9 @@ class WarpSimulator:
         """See `Simulator.reset`."""
         new = self._default | {"qpos": qpos, "qvel": qvel}
         for name, live in self.memory.items():
-            live.copy_(torch.where(_over(mask, live), new[name], live))
+            live.copy_(torch.where(over(mask, live), new[name], live))
         for value in self.state.step_values.values():
-            value.masked_fill_(_over(mask, value), 0.0)
+            value.masked_fill_(over(mask, value), 0.0)
 
     def load(self, memory: Mapping[str, Tensor]) -> None:
         """See `Simulator.load`."""
@@ -211,8 +212,3 @@ class WarpSimulator:
             live.copy_(memory[name])
         self._overflow.zero_()  # that of a step that nobody asked for
         return capture.graph  # type: ignore[return-value]
-
-
-def _over(mask: Tensor, values: Tensor) -> Tensor:
-    """Return `mask` (num_envs,) with the dimensions of `values` (num_envs, ...)."""
-    return mask.view(-1, *[1] * (values.dim() - 1))
