@@ -86,8 +86,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         metavar="N",
         help="numbers of worlds (default: 256 1024 4096 16384)",
     )
-    parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto, which prefers CUDA)")
-    parser.add_argument("--backend", default="auto", choices=("auto", "native", "warp"), help="physics engine (default: auto)")
+    parser.add_engine()
     parser.add_argument("--task", metavar="NAME", help=f"{', '.join(task_names())}, or a YAML file (default: the policy's)")
     parser.add_argument(
         "--checkpoint",
@@ -98,7 +97,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--stock", action="store_true", help="measure training with rsl-rl's own PPO too")
     parser.add_argument("--json", metavar="FILE", help="write everything that was measured")
     parser.add_argument("--plot", metavar="FILE", help="draw the rates over the number of worlds (.png, .svg or .pdf)")
-    parser.add_argument("overrides", nargs="*", metavar="key.path=value", help="override any field of the task")
+    parser.add_overrides()
     options = parser.parse(argv)
     for name, values in (("--num-envs", options.num_envs), ("--rounds", [options.rounds])):
         if min(values) < 1:

@@ -24,7 +24,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         "--checkpoint", metavar="PATH_OR_RUN", required=True, help="a checkpoint, or a run folder for its newest"
     )
     parser.add_argument("--out", metavar="FILE.onnx", default="policy.onnx", help="file to write (default: policy.onnx)")
-    parser.add_argument("overrides", nargs="*", metavar="key.path=value", help="override any field of the task, as sim.robot")
+    parser.add_overrides("override any field of the task, as sim.robot")
     options = parser.parse(argv)
     for override in options.overrides:
         if override.startswith("ppo."):

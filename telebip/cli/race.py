@@ -81,11 +81,10 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--task", default="telebip_flat", metavar="NAME", help=f"{', '.join(task_names())}, or a YAML file")
     parser.add_argument("--samples", type=whole_number, default=4_500_000, metavar="N", help="samples of each (default: 4.5e6)")
     parser.add_argument("--seeds", type=int, default=3, metavar="N", help="races, from the task's seed on (default: 3)")
-    parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto, which prefers CUDA)")
-    parser.add_argument("--backend", default="auto", choices=("auto", "native", "warp"), help="physics engine (default: auto)")
+    parser.add_engine()
     parser.add_argument("--json", metavar="FILE", help="write every iteration's return and time, after each seed")
     parser.add_argument("--plot", metavar="FILE", help="draw the returns over samples and over time (.png, .svg or .pdf)")
-    parser.add_argument("overrides", nargs="*", metavar="key.path=value", help="override any field of the task")
+    parser.add_overrides()
     options = parser.parse(argv)
     for name, value in (("--samples", options.samples), ("--seeds", options.seeds)):
         if value < 1:

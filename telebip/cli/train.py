@@ -214,7 +214,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--num-envs", metavar="N", help="worlds in parallel (default: the task's num_envs)")
     parser.add_argument("--max-iterations", metavar="N", help="total of the run (default: the task's ppo.max_iterations)")
     parser.add_argument("--seed", metavar="S", help="of worlds and networks (default: the task's seed)")
-    parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto, which prefers CUDA)")
+    parser.add_device()
     parser.add_argument(
         "--backend",
         default="auto",
@@ -229,7 +229,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--viewer", choices=("none", "rerun"), default="none", help="watch the training (default: none)")
     parser.add_argument("--connect", metavar="HOST:PORT", help="a running rerun viewer (default: start one here)")
-    parser.add_argument("overrides", nargs="*", metavar="key.path=value", help="override any field of the task")
+    parser.add_overrides()
     options = parser.parse(argv)
     check_connect(options)
     if options.resume and options.log_dir:

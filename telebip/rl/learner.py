@@ -27,7 +27,7 @@ def make_learner(
     ppo: PpoConfig,
     obs_groups: dict[str, list[str]],
     ranks: Ranks,
-    algorithm: type[PPO] | None = None,
+    algorithm: str | None = None,
 ) -> PPO:
     """Return a learner with new networks, which draw their weights from torch's generator, the same in every process.
 
@@ -36,17 +36,18 @@ def make_learner(
         ppo: the learning.
         obs_groups: which groups of observations actor and critic see.
         ranks: the processes that learn together.
-        algorithm: what learns; the one that `ppo.algorithm` names if not given.
+        algorithm: of `ALGORITHMS`; `ppo.algorithm` if not given.
 
     Raises:
         UserError: an iteration has too few samples, or there is no such algorithm.
     """
     _check_batch(env.num_envs, ppo)
-    if ppo.algorithm not in ALGORITHMS:
-        raise UserError(f"ppo.algorithm: unknown algorithm '{ppo.algorithm}'; {nearest(ppo.algorithm, ALGORITHMS)}")
+    name = algorithm or ppo.algorithm
+    if name not in ALGORITHMS:
+        raise UserError(f"ppo.algorithm: unknown algorithm '{name}'; {nearest(name, ALGORITHMS)}")
     obs, device = env.get_observations(), str(env.device)
     network = network_class(ppo.mixed_precision, torch.device(device))
-    learner = (algorithm or ALGORITHMS[ppo.algorithm])(
+    learner = ALGORITHMS[name](
         network(obs, obs_groups, "actor", env.num_actions, **actor_cfg(ppo)),
         network(obs, obs_groups, "critic", 1, **critic_cfg(ppo)),
         RolloutStorage("rl", env.num_envs, ppo.num_steps_per_env, obs, [env.num_actions], device),

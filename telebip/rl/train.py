@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from rsl_rl.algorithms import PPO
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -33,8 +32,6 @@ from telebip.rl.symmetry import SymmetricEnv, joint_mirror
 class Trainer:
     """Trains one policy in one run folder."""
 
-    algorithm: type[PPO] | None = None  # None: the one that `ppo.algorithm` names
-
     def __init__(
         self,
         env: TelebipEnv,
@@ -42,10 +39,12 @@ class Trainer:
         run_dir: Path,
         ranks: Ranks | None = None,
         note: Callable[[str], None] = lambda line: print(line, file=sys.stderr),
+        algorithm: str | None = None,
     ) -> None:
         """Build the learner for `env`, the same in every process of `ranks`; nothing is written before `learn`.
 
-        `note` is told, in a line each, what a user should know though the training goes on.
+        `note` is told, in a line each, what a user should know though the training goes on. `algorithm` is one of
+        `telebip.rl.learner.ALGORITHMS`, the task's if not given.
 
         Raises:
             UserError: an iteration has too few samples, or the task asks for a symmetry that it has not.
@@ -55,7 +54,7 @@ class Trainer:
         ppo = env.cfg.ppo
         self.view = SymmetricEnv(env) if ppo.symmetry == "phase" else env
         torch.manual_seed(env.cfg.seed)
-        self.learner = make_learner(self.view, ppo, obs_groups(env.layout()), self.ranks, self.algorithm)
+        self.learner = make_learner(self.view, ppo, obs_groups(env.layout()), self.ranks, algorithm)
         self._saver = Saver(self.ranks, env.device, ppo.keep_checkpoints, note)
         self._episodes = EpisodeStatistics(env.num_envs, env.device)
         # Spread the time-outs over the iterations.

@@ -32,7 +32,6 @@ from telebip.robot import Robot
 from telebip.sim import Backend
 from telebip.tools.engines import BareEngine, recorded
 from telebip.tools.measuring import Stopwatch, allocated_bytes
-from telebip.tools.stock import StockTrainer
 
 WARM_UP = 2.0
 """How long the robots walk before anything is measured [s]."""
@@ -91,7 +90,7 @@ class Stages:
         self._trainer.learner.train_mode()
         self._iteration(self._trainer)  # allocates what an iteration needs
         self.bytes_per_env = (allocated_bytes(device) - before) / cfg.num_envs
-        self._stock = StockTrainer(env, "", Path()) if with_stock else None
+        self._stock = Trainer(env, "", Path(), algorithm="ppo") if with_stock else None
         if self._stock:
             self._stock.learner.train_mode()
         self._engine = BareEngine(env)

@@ -20,10 +20,10 @@ from telebip.rl.process import random_state, set_random_state
 from telebip.rl.train import Trainer
 from telebip.robot import Robot
 from telebip.sim import Backend
-from telebip.tools.stock import StockTrainer
 
 Curve = dict[str, list[float | None]]
-RACERS = {"telebip": Trainer, "stock": StockTrainer}
+RACERS = {"telebip": None, "stock": "ppo"}
+"""Whose algorithm a racer has: the task's own, or rsl-rl's as it stands."""
 
 
 def race(
@@ -54,9 +54,9 @@ def race(
     """
     racers: dict[str, Trainer] = {}
     random = {}  # each racer's own random numbers
-    for name, trainer in RACERS.items():
+    for name, algorithm in RACERS.items():
         faults = Path(tempfile.gettempdir(), f"telebip_race_{name}")  # where they would be dumped
-        racers[name] = trainer(TelebipEnv(cfg, robot, device, backend), "", faults)
+        racers[name] = Trainer(TelebipEnv(cfg, robot, device, backend), "", faults, algorithm=algorithm)
         random[name] = random_state(device)
     curves: dict[str, Curve] = {name: {"episode_return": [], "episode_length": [], "seconds": []} for name in racers}
     at: list[int] = []

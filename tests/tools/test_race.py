@@ -11,7 +11,6 @@ from telebip.env import TelebipEnv
 from telebip.rl.train import Trainer
 from telebip.robot import Robot
 from telebip.tools.race import RACERS, race, verdict
-from telebip.tools.stock import StockTrainer
 
 SMALL = ("num_envs=8", "ppo.num_steps_per_env=10", "ppo.hidden_dims=[16,16]", "episode.length=0.2", "seed=4")
 
@@ -35,8 +34,8 @@ def test_both_train_for_as_many_samples_as_asked_for(robot: Robot) -> None:
 def test_a_racer_learns_what_it_learns_alone(robot: Robot, precision: str) -> None:
     config = load_task("telebip_flat", [*SMALL, f"ppo.mixed_precision={precision}"])
     raced = race(config, robot, torch.device("cpu"), "native", 240)
-    for name, racer in RACERS.items():
-        alone = racer(TelebipEnv(config, robot, "cpu", "native"), "", Path())
+    for name, algorithm in RACERS.items():
+        alone = Trainer(TelebipEnv(config, robot, "cpu", "native"), "", Path(), algorithm=algorithm)
         returns = [alone.iterate()["train/episode_return"] for _ in range(3)]
         assert raced[name]["episode_return"] == returns
 
@@ -44,7 +43,9 @@ def test_a_racer_learns_what_it_learns_alone(robot: Robot, precision: str) -> No
 @pytest.mark.parametrize("precision", ["never", "always"])
 def test_the_stock_racer_is_rsl_rls_own_on_the_same_networks(robot: Robot, precision: str) -> None:
     config = load_task("telebip_flat", [*SMALL, f"ppo.mixed_precision={precision}"])
-    own, stock = (racer(TelebipEnv(config, robot, "cpu", "native"), "", Path()).learner for racer in (Trainer, StockTrainer))
+    own, stock = (
+        Trainer(TelebipEnv(config, robot, "cpu", "native"), "", Path(), algorithm=name).learner for name in RACERS.values()
+    )
     assert type(stock) is PPO
     assert type(stock.optimizer) is torch.optim.Adam and not stock.optimizer.defaults["fused"]
     assert type(own.actor) is type(stock.actor)
