@@ -96,6 +96,7 @@ def joined(ranks: Ranks, device: "torch.device") -> Iterator[None]:
     if ranks.size == 1:
         yield
         return
+    import torch._dynamo  # which Adam imports; where there is a group, it would keep it, and gloo's threads, until the end
     import torch.distributed
 
     if device.type == "cuda":
@@ -103,6 +104,5 @@ def joined(ranks: Ranks, device: "torch.device") -> Iterator[None]:
     torch.distributed.init_process_group("nccl" if device.type == "cuda" else "gloo", rank=ranks.rank, world_size=ranks.size)
     try:
         yield
-        torch.distributed.barrier()  # nobody leaves while another one still talks to it
     finally:
         torch.distributed.destroy_process_group()

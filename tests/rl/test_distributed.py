@@ -112,17 +112,33 @@ def test_two_processes_learn_what_one_does(tmp_path: Path) -> None:
     assert first["stops"] == second["stops"] == [True, False]  # one that wants to stop stops both
 
 
+COUNTING = """
+import atexit, runpy
+from pathlib import Path
+
+def count() -> None:
+    threads = [file.read_text() for file in Path("/proc/self/task").glob("*/comm")]  # none but on Linux
+    print("gloo's threads at the end:", sum("gloo" in name for name in threads))
+
+atexit.register(count)
+runpy.run_path("scripts/train.py", run_name="__main__")
+"""
+
+
 def test_torchrun_trains_into_one_folder(tmp_path: Path) -> None:
+    program = tmp_path / "counting.py"
+    program.write_text(COUNTING)
     tiny = ("--num-envs", "4", "--device", "cpu", "--max-iterations", "2", "ppo.num_steps_per_env=5", "ppo.hidden_dims=[16,16]")
     torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     done = subprocess.run(
-        [*torchrun, "scripts/train.py", "--task", "telebip_flat", "--log-dir", str(tmp_path), *tiny],
+        [*torchrun, str(program), "--task", "telebip_flat", "--log-dir", str(tmp_path), *tiny],
         cwd=ROOT,
         capture_output=True,
         text=True,
         timeout=300,
     )
     assert done.returncode == 0, done.stderr
+    assert done.stdout.count("gloo's threads at the end: 0") == 2  # they would abort the process now and then
     assert done.stdout.count("telebip_flat: 2 processes x 4 worlds on cpu") == 1
     (run_dir,) = (tmp_path / "telebip_flat").iterdir()
     assert sorted(path.name for path in run_dir.glob("*.pt")) == ["model_2.pt", "policy.pt"]
