@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -51,6 +52,20 @@ def put_low(env: TelebipEnv, worlds: list[int]) -> None:
     qpos = env.sim.state.qpos.clone()
     qpos[:, 2] = 0.3
     put(env, worlds, qpos, torch.zeros(env.num_envs, 12))
+
+
+def same(a: object, b: object) -> None:
+    """Assert that two results of a step, or parts of them, are the same to the last bit."""
+    if isinstance(a, Tensor) and isinstance(b, Tensor):
+        torch.testing.assert_close(a, b, rtol=0.0, atol=0.0, equal_nan=True)
+    elif isinstance(a, (dict, TensorDict)) and isinstance(b, (dict, TensorDict)):
+        assert set(a.keys()) == set(b.keys())
+        for name in a.keys():  # noqa: SIM118 (a TensorDict iterates over its rows)
+            same(a[name], b[name])
+    else:
+        assert isinstance(a, (tuple, list)) and isinstance(b, (tuple, list)), (a, b)
+        for part, other in zip(a, b, strict=True):
+            same(part, other)
 
 
 def quat_mul(a: Tensor, b: Tensor) -> Tensor:
