@@ -133,8 +133,7 @@ class TelebipEnv(VecEnv):
             name: binder.bind("termination", "terminations", name, params) for name, params in cfg.terminations.items()
         }
         self._events = Events(cfg.events, binder)
-        ranges = [cfg.commands.lin_vel_x, cfg.commands.lin_vel_y, cfg.commands.ang_vel_z]
-        self._drawn_commands = binder.random("commands", {"command": ranges})
+        self._drawn_commands = binder.random("commands", {"command": list(cfg.commands.ranges)})
         self._random = binder.allocate()
         self.state.reset(self._everywhere())  # of what finding the sizes has left
         self.reward_names = tuple(self._rewards)

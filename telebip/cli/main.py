@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from types import ModuleType
 
 from telebip import __version__
-from telebip.cli import benchmark, common, evaluate, export, play, race, reproduce, train
+from telebip.cli import benchmark, common, evaluate, export, play, race, reproduce, sweep, train
 from telebip.errors import UserError, nearest
 
 COMMANDS: dict[str, ModuleType] = {
@@ -16,6 +16,7 @@ COMMANDS: dict[str, ModuleType] = {
     "export": export,
     "benchmark": benchmark,
     "race": race,
+    "sweep": sweep,
 }
 """Name -> module with `main(argv)`; the first line of its docstring is the command's description."""
 

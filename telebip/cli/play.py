@@ -46,7 +46,7 @@ def _play(options: argparse.Namespace) -> None:
     overrides = [*([] if options.seed is None else [f"seed={options.seed}"]), *options.overrides]
     config = checkpoint.config if checkpoint else load_task(options.task)
     config = as_evaluated(config, options.num_envs, options.duration, overrides, disturbed=options.disturb)
-    command = options.command or [0.5 * (low + high) for low, high in _ranges(config)]
+    command = options.command or [0.5 * (low + high) for low, high in config.commands.ranges]
 
     from telebip.cli.console import Console
 
@@ -166,15 +166,11 @@ def _lines(s) -> str:
     return "\n".join(f"  {name:18}{value}" for name, value in rows)
 
 
-def _ranges(config: TaskConfig) -> tuple[tuple[float, float], ...]:
-    return config.commands.lin_vel_x, config.commands.lin_vel_y, config.commands.ang_vel_z
-
-
 def _warn_untrained(console, command: Sequence[float], trained: TaskConfig) -> None:
     """Say so if the policy never saw such a command in training."""
     names = ("forward speed", "leftward speed", "yaw rate")
     slack = (0.0, 0.0, trained.commands.heading_limit if trained.commands.heading_gain > 0 else 0.0)
-    for name, value, (low, high), extra in zip(names, command, _ranges(trained), slack, strict=True):
+    for name, value, (low, high), extra in zip(names, command, trained.commands.ranges, slack, strict=True):
         if not low - extra <= value <= high + extra:
             console.print(f"note: {name} {value:g} lies outside what this policy was trained on, [{low:g}, {high:g}]")
 

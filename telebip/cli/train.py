@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from telebip.cli.common import Parser, check_connect, invocation, open_checkpoint, resolve_device
 from telebip.config import TaskConfig, load_task, task_names
 from telebip.errors import UserError
+from telebip.viz.opengl import choose_opengl
 
 if TYPE_CHECKING:
     from telebip.cli.console import Console
@@ -20,12 +21,17 @@ if TYPE_CHECKING:
     from telebip.sim import Backend
 
 EXAMPLES = """\
+  train.py --task telebip_quick --record
+  train.py --task telebip_quick --until-walking
   train.py --task telebip_flat
   train.py --task telebip_fast --num-envs 2048 --max-iterations 500 ppo.num_steps_per_env=24
   train.py --resume runs/telebip_flat/2026-01-31_12-00-00 --max-iterations 400
   train.py --task telebip_flat --viewer rerun               (curves and robots, live)
   tensorboard --logdir runs
 """
+
+RECORDED = 10.0
+"""How long the walk lasts that `--record` records [s]."""
 
 Report = Callable[[dict[str, float]], None]
 """Takes what TensorBoard gets of an iteration."""
@@ -42,11 +48,23 @@ class Start:
     checkpoint: "Checkpoint | None" = None  # where to go on from
 
 
+@dataclass(frozen=True)
+class View:
+    """How a training is looked at."""
+
+    is_watched: bool = False  # in the rerun viewer, while it goes on
+    connect: str | None = None  # address of a running viewer
+    record: bool = False  # whether the policy's walk is recorded at the end
+
+
 def main(argv: Sequence[str] | None = None) -> None:
     """Parse arguments and train."""
     options = _parse(argv)
+    if options.record:
+        choose_opengl()
     start = _resumed(options) if options.resume else _new(options)
-    train(start, options.device, options.backend, options.viewer == "rerun", options.connect)
+    view = View(options.viewer == "rerun", options.connect, options.record)
+    train(start, options.device, options.backend, options.until_walking, view)
 
 
 def _new(options: argparse.Namespace) -> Start:
@@ -87,32 +105,33 @@ def train(
     start: Start,
     device_name: str = "auto",
     backend: "Backend" = "auto",
-    is_watched: bool = False,
-    connect: str | None = None,
+    until_walking: bool = False,
+    view: View = View(),
 ) -> bool:
-    """Train with progress and logs until the end or Ctrl-C.
+    """Train with progress and logs until the end, until the policy walks, or until Ctrl-C.
 
     Args:
         start: what to train, and where.
         device_name: as `resolve_device` takes it.
         backend: physics engine.
-        is_watched: whether to show the training in the rerun viewer.
-        connect: address of a running viewer.
+        until_walking: whether to end as soon as the policy walks, see `telebip.eval.walking`.
+        view: how to look at it.
 
     Returns:
-        Whether all iterations are done.
+        Whether all iterations are done, or the policy walks and that was enough.
     """
     from telebip.cli.console import Console
     from telebip.rl.distributed import Ranks, joined
 
     ranks = Ranks.from_environment()
-    console, is_watched = Console(quiet=not ranks.is_main), is_watched and ranks.is_main
+    console, is_watched = Console(quiet=not ranks.is_main), view.is_watched and ranks.is_main
     with console.status("loading torch and the physics engine"):
+        from telebip.eval.walking import UntilWalking
         from telebip.rl.process import keep_freed_memory
     if is_watched:
         from telebip.viz.rerun import require_viewer
 
-        require_viewer(connect)
+        require_viewer(view.connect)
     device = resolve_device(ranks.device_name(device_name))
     if device.type == "cpu":
         keep_freed_memory()
@@ -129,19 +148,54 @@ def train(
         if ranks.is_main:
             _prepare_folder(trainer, console)
         _announce(trainer, console, restart)
-        stop = stack.enter_context(stop_on_signal(console))
-        report = stack.enter_context(progress_bar(console, trainer))
+        asked = stack.enter_context(stop_on_signal(console))
+        walking = UntilWalking(trainer) if until_walking and ranks.is_main else None
+        report = stack.enter_context(progress_bar(console, trainer, walking))
         if is_watched:
             from telebip.viz.live import live_view
 
-            report = _both(report, stack.enter_context(live_view(trainer, connect)))
-        trainer.learn(stop, report)
-    finished = trainer.iteration >= total
-    if not finished:
-        again = f"{invocation('train')} --resume {trainer.run_dir}"
-        console.print(f"stopped after iteration {trainer.iteration} of {total}; go on with: {again}")
-    console.print(f"see it walk: {invocation('play')} --checkpoint {trainer.run_dir}")
-    return finished
+            report = _both(report, stack.enter_context(live_view(trainer, view.connect)))
+        trainer.learn(lambda: asked() or bool(walking and walking.walks()), report)
+        walks = bool(walking and walking.walks())
+        if walks:
+            console.print(f"it walks after {trainer.samples / 1e6:.2f} M samples: {walking and walking.last}")
+        if trainer.iteration < total:
+            again = f"{invocation('train')} --resume {trainer.run_dir}"
+            console.print(f"stopped after iteration {trainer.iteration} of {total}; go on with: {again}")
+        if ranks.is_main and view.record:
+            _record(trainer, console)
+    console.print(f"see it walk: {invocation('play')} --checkpoint {trainer.run_dir} --viewer rerun")
+    return walks or trainer.iteration >= total
+
+
+def _record(trainer: "Trainer", console: "Console") -> None:
+    """Let one robot walk for 10 s, record it in the run's folder, and draw it where there is OpenGL."""
+    from telebip.env import TelebipEnv
+    from telebip.eval.conditions import as_evaluated
+    from telebip.eval.learning import learning_curve
+    from telebip.rl.policy import load_network
+    from telebip.rollout import roll_out
+    from telebip.viz.drawing import draw_learning
+    from telebip.viz.picture import strobe
+    from telebip.viz.rerun import record
+    from telebip.viz.scene import line_up
+
+    cfg, robot, run_dir = trainer.env.cfg, trainer.env.robot, trainer.run_dir
+    env = TelebipEnv(as_evaluated(cfg, 1, RECORDED), robot, trainer.env.device, trainer.env.sim.backend)
+    env.set_command(*(0.5 * (low + high) for low, high in cfg.commands.ranges))
+    rollout = roll_out(env, load_network(trainer.policy(), env.device), round(RECORDED / env.step_dt))
+    actors = line_up([(trainer.task, rollout)])
+    record(actors, robot, run_dir / "walk.rrd")
+    console.print(f"recorded its walk; look at it with: rerun {run_dir / 'walk.rrd'}")
+    curves = learning_curve(run_dir)
+    if curves:
+        draw_learning(curves, trainer.task).savefig(run_dir / "learning.png", dpi=150)
+        console.print(f"drew {run_dir / 'learning.png'}")
+    try:
+        strobe(actors[0], robot, run_dir / "walk.png")
+        console.print(f"drew {run_dir / 'walk.png'}")
+    except UserError as error:
+        console.print(f"note: no picture of it: {error}")
 
 
 def _make_trainer(start: Start, ranks: "Ranks", device: str, backend: "Backend", console: "Console") -> "Trainer":
@@ -227,6 +281,14 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         metavar="RUN_OR_CHECKPOINT",
         help="go on with a run, in its folder and with its configuration, up to --max-iterations in all",
     )
+    parser.add_argument(
+        "--until-walking",
+        action="store_true",
+        help="end as soon as the policy walks: no falls and mean speeds within 10 %%, twice in a row, ten iterations apart",
+    )
+    parser.add_argument(
+        "--record", action="store_true", help="at the end, leave walk.rrd, walk.png and learning.png in the run's folder"
+    )
     parser.add_argument("--viewer", choices=("none", "rerun"), default="none", help="watch the training (default: none)")
     parser.add_argument("--connect", metavar="HOST:PORT", help="a running rerun viewer (default: start one here)")
     parser.add_overrides()
@@ -264,8 +326,11 @@ def stop_on_signal(console):
 
 
 @contextmanager
-def progress_bar(console, trainer):
-    """Yield a function that shows an iteration's scalars: a live bar on a terminal, else one line per fiftieth of the run."""
+def progress_bar(console, trainer, walking=None):
+    """Yield a function that shows an iteration's scalars: a live bar on a terminal, else one line per fiftieth of the run.
+
+    Where the training looks whether the policy walks, what it saw last stands beside them.
+    """
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     columns = (
@@ -288,6 +353,8 @@ def progress_bar(console, trainer):
                 f"length {scalars['train/episode_length']:.0f}/{trainer.env.max_episode_length} | "
                 f"error {scalars['error/lin_vel_mps']:.2f} m/s | {scalars['walk/falls_per_minute']:.1f} falls/min"
             )
+            if walking and walking.last:
+                text += f" | last look: {walking.last}"
             progress.update(task, completed=trainer.iteration, description=text)
             if not console.is_terminal and (trainer.iteration % every == 0 or trainer.iteration == total):
                 console.print(f"{trainer.iteration:5d}/{total}  {text}", soft_wrap=True)

@@ -58,6 +58,11 @@ class CommandsConfig:
     heading_gain: Annotated[float, Quantity("1/s", ge=0)]
     heading_limit: Annotated[float, Quantity("rad/s", ge=0)]
 
+    @property
+    def ranges(self) -> tuple[tuple[float, float], ...]:
+        """Of vx and vy [m/s] and the yaw rate [rad/s]."""
+        return self.lin_vel_x, self.lin_vel_y, self.ang_vel_z
+
 
 @dataclass(frozen=True)
 class PpoConfig:

@@ -3,8 +3,26 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
+import torch
+from torch import Tensor
+
 from telebip.config import TaskConfig, load_task
 from telebip.mdp.term import find
+
+SPEEDS = (0.5, 0.7, 1.0, -0.3)
+"""Forward speeds at which walking is measured, where a policy was trained on them [m/s]."""
+
+
+def trained_speeds(config: TaskConfig) -> tuple[float, ...]:
+    """Return those of `SPEEDS` that a task trains, or the middle of its range if there is none [m/s]."""
+    low, high = config.commands.lin_vel_x
+    return tuple(speed for speed in SPEEDS if low <= speed <= high) or (round(0.5 * (low + high), 3),)
+
+
+def forward_commands(speeds: Sequence[float], worlds: int, device: torch.device) -> Tensor:
+    """Return the commands of `worlds` worlds for each forward speed, one speed's worlds after the other's, (num_envs, 3)."""
+    forward = torch.tensor(speeds, device=device).repeat_interleave(worlds)
+    return torch.nn.functional.pad(forward[:, None], (0, 2))
 
 
 def as_evaluated(

@@ -18,7 +18,7 @@ from telebip.control.factory import with_estimate
 from telebip.control.policy import Policy
 from telebip.env import TelebipEnv
 from telebip.errors import UserError, nearest
-from telebip.eval.conditions import as_evaluated
+from telebip.eval.conditions import SPEEDS, as_evaluated, forward_commands, trained_speeds
 from telebip.eval.gait import summarise_gait
 from telebip.eval.learning import learning_curve
 from telebip.eval.push import PushProtocol, push_limits, push_trial
@@ -28,7 +28,6 @@ from telebip.rollout import Rollout, roll_out
 from telebip.sim import Backend, choose_backend
 
 SUITES = ("tracking", "push", "gait", "learning")
-COMMANDS = (0.5, 0.7, 1.0, -0.3)  # forward speeds of the tracking suite, where the policy was trained on them [m/s]
 Progress = Callable[[str, int, int], None]  # called with what is running, the finished steps and their total
 
 
@@ -58,7 +57,7 @@ class Protocol:
     worlds: int = 64
     duration: float = 20.0  # s
     skip: float = 5.0  # s, left out of all means
-    commands: tuple[float, ...] | None = None  # m/s; None: those of `COMMANDS` that the policy was trained on
+    commands: tuple[float, ...] | None = None  # m/s; None: those of `SPEEDS` that the policy was trained on
     push: PushProtocol = field(default_factory=PushProtocol)
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
     backend: Backend = "auto"
@@ -139,9 +138,7 @@ def commands_of(candidate: Candidate, protocol: Protocol) -> tuple[float, ...]:
     """Return the forward speeds to ask for [m/s]."""
     if protocol.commands is not None:
         return protocol.commands
-    low, high = candidate.task.commands.lin_vel_x
-    known = tuple(c for c in COMMANDS if candidate.is_model_based or low <= c <= high)
-    return known or (round(0.5 * (low + high), 3),)
+    return SPEEDS if candidate.is_model_based else trained_speeds(candidate.task)
 
 
 def make_env(candidate: Candidate, robot: Robot, protocol: Protocol, num_envs: int, duration: float) -> TelebipEnv:
@@ -155,8 +152,7 @@ def _walk(candidate: Candidate, robot: Robot, protocol: Protocol, progress: Prog
     """Walk all commands as one batch, and return each command's worlds."""
     commands = commands_of(candidate, protocol)
     env = make_env(candidate, robot, protocol, len(commands) * protocol.worlds, protocol.duration)
-    forward = torch.tensor(commands, device=env.device).repeat_interleave(protocol.worlds)
-    env.set_commands(torch.nn.functional.pad(forward[:, None], (0, 2)))
+    env.set_commands(forward_commands(commands, protocol.worlds, env.device))
     steps = max(1, round(protocol.duration / env.step_dt))
     rollout = roll_out(env, candidate.make_policy(env), steps, lambda step: progress("walking", step, steps))
     n = protocol.worlds

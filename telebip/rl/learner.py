@@ -9,7 +9,7 @@ from telebip.config.schema import PpoConfig
 from telebip.errors import UserError, nearest
 from telebip.mdp.curriculum import progress
 from telebip.rl.distributed import Ranks
-from telebip.rl.networks import actor_cfg, critic_cfg, network_class
+from telebip.rl.networks import make_networks
 from telebip.rl.ppo import FastPPO
 
 ALGORITHMS: dict[str, type[PPO]] = {"fast_ppo": FastPPO, "ppo": PPO}
@@ -46,10 +46,10 @@ def make_learner(
     if name not in ALGORITHMS:
         raise UserError(f"ppo.algorithm: unknown algorithm '{name}'; {nearest(name, ALGORITHMS)}")
     obs, device = env.get_observations(), str(env.device)
-    network = network_class(ppo.mixed_precision, torch.device(device))
+    actor, critic = make_networks(obs, obs_groups, env.num_actions, ppo, torch.device(device))
     learner = ALGORITHMS[name](
-        network(obs, obs_groups, "actor", env.num_actions, **actor_cfg(ppo)),
-        network(obs, obs_groups, "critic", 1, **critic_cfg(ppo)),
+        actor,
+        critic,
         RolloutStorage("rl", env.num_envs, ppo.num_steps_per_env, obs, [env.num_actions], device),
         device=device,
         multi_gpu_cfg=ranks.multi_gpu_cfg,

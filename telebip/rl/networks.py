@@ -1,12 +1,13 @@
 """The networks: rsl-rl's, with matrix products in bfloat16 where that is faster."""
 
+import math
 from typing import Any
 
 import torch
 from rsl_rl.models import MLPModel
 from rsl_rl.modules.distribution import GaussianDistribution
 from tensordict import TensorDict
-from torch import Tensor
+from torch import Tensor, nn
 
 from telebip.config.schema import PpoConfig
 
@@ -17,6 +18,35 @@ class Gaussian(GaussianDistribution):
     def sample(self) -> Tensor:
         """Return mean + std * noise, the same numbers as those of `torch.normal`."""
         return torch.randn_like(self.mean).mul_(self.std).add_(self.mean)
+
+
+class Elu(torch.autograd.Function):
+    """ELU as max(x, 2^(x log2 e) - 1), which is e^x - 1 where x < 0 and x elsewhere.
+
+    torch computes its own with an exponential that does not use a CPU's vector unit; this takes half the time. The gradient
+    comes from the result y, as y + 1 where x < 0. Equal to torch's ELU in bfloat16, and to 1e-7 in float32.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        """Return the ELU of `x`, of its shape and type."""
+        negative = x.clamp(max=0.0) if x.dtype == torch.float32 else x.float().clamp_(max=0.0)
+        y = torch.maximum(x, negative.mul_(math.log2(math.e)).exp2_().sub_(1.0).to(x.dtype))
+        ctx.save_for_backward(y)
+        return y
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
+        """Return the gradient with respect to `x`, from that with respect to y."""
+        return torch.ops.aten.elu_backward(gradients[0], 1.0, 1.0, 1.0, True, *ctx.saved_tensors)
+
+
+class CpuElu(nn.Module):
+    """`Elu` as a layer."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return the ELU of `x`."""
+        return Elu.apply(x)
 
 
 class Bfloat16Model(MLPModel):
@@ -46,9 +76,18 @@ def output(network: MLPModel, latent: Tensor) -> Tensor:
         return network.mlp(latent).float()
 
 
-def network_class(mixed_precision: str, device: torch.device) -> type[MLPModel]:
-    """Return what actor and critic are made of."""
-    return Bfloat16Model if arithmetic(mixed_precision, device) == "bfloat16" else MLPModel
+def make_networks(
+    obs: TensorDict, obs_groups: dict[str, list[str]], num_actions: int, ppo: PpoConfig, device: torch.device
+) -> tuple[MLPModel, MLPModel]:
+    """Return a new actor and a new critic, which draw their weights from torch's generator."""
+    model = Bfloat16Model if arithmetic(ppo.mixed_precision, device) == "bfloat16" else MLPModel
+    actor = model(obs, obs_groups, "actor", num_actions, **actor_cfg(ppo))
+    critic = model(obs, obs_groups, "critic", 1, **critic_cfg(ppo))
+    for network in (actor, critic):
+        for i, layer in enumerate(network.mlp):
+            if isinstance(layer, nn.ELU) and device.type == "cpu":
+                network.mlp[i] = CpuElu()
+    return actor, critic
 
 
 def arithmetic(mixed_precision: str, device: torch.device) -> str:

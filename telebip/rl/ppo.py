@@ -58,6 +58,15 @@ class FastPPO(PPO):
         self.optimizer = torch.optim.Adam(parameters, lr=self.learning_rate, fused=True)
         self._worker = ThreadPoolExecutor(1, "critic")
 
+    @property
+    def learning_rate(self) -> float:
+        """Adam's rate, which lives on the device: the adaptive schedule changes it there, and waits for nothing."""
+        return self._rate.item()
+
+    @learning_rate.setter
+    def learning_rate(self, rate: float | Tensor) -> None:
+        self._rate = torch.tensor(float(rate), device=self.device)
+
     def compute_returns(self, obs: TensorDict) -> None:
         """Compute returns and normalised advantages of the stored rollout, which ended at `obs`."""
         super().compute_returns(obs)
@@ -67,6 +76,8 @@ class FastPPO(PPO):
     def update(self) -> dict[str, float]:
         """Run the configured epochs over the stored rollout and return the mean losses."""
         sums = torch.zeros(3, device=self.device)
+        for group in self.optimizer.param_groups:
+            group["lr"] = self._rate
         with self._threads() as together:
             for batch in self._mini_batches() * self.num_learning_epochs:
                 self.optimizer.zero_grad()
@@ -138,13 +149,10 @@ class FastPPO(PPO):
         """Lower the learning rate by 1.5 where the KL divergence is over twice the desired one, raise it where under half."""
         if self.schedule != "adaptive":
             return
-        divergence = self._sum_over_processes(kl).item() / self.gpu_world_size
-        if divergence > 2.0 * self.desired_kl:
-            self.learning_rate = max(1e-5, self.learning_rate / 1.5)
-        elif 0.0 < divergence < self.desired_kl / 2.0:
-            self.learning_rate = min(1e-2, self.learning_rate * 1.5)
-        for group in self.optimizer.param_groups:
-            group["lr"] = self.learning_rate
+        divergence, rate = self._sum_over_processes(kl) / self.gpu_world_size, self._rate
+        is_far, is_near = divergence > 2.0 * self.desired_kl, (divergence > 0.0) & (divergence < 0.5 * self.desired_kl)
+        slower, faster = (rate / 1.5).clamp(min=1e-5), (1.5 * rate).clamp(max=1e-2)
+        rate.copy_(torch.where(is_far, slower, torch.where(is_near, faster, rate)))
 
     def _normalize_advantages(self) -> None:
         """Normalise by the mean and deviation over all processes' samples, as rsl-rl does over those of one."""

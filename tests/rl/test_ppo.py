@@ -79,6 +79,8 @@ def test_an_update_equals_rsl_rls(robot: Robot, overrides: tuple[str, ...], prec
     assert torch.get_num_threads() == threads
     assert all(group.pop("fused") for group in moments["param_groups"])
     assert not any(group.pop("fused") for group in expected["param_groups"])
+    rates = [[float(group.pop("lr")) for group in state["param_groups"]] for state in (moments, expected)]
+    assert rates[0] == pytest.approx(rates[1])
     assert moments["param_groups"] == expected["param_groups"]
 
 
