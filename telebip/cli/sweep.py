@@ -53,12 +53,12 @@ def main(argv: Sequence[str] | None = None) -> None:
                     content = {**about, **describe_code(), "settings": options.setting, "verdict": found, "results": results}
                     Path(options.json).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     console.print(
-        f"\n{options.task} on {about['machine']}, torch threads: {about['threads']}; median (worst) of {options.seeds}"
+        f"\n{options.task} on {about['machine']}, torch threads: {about['threads']}; {options.seeds} seeds: median (worst)"
     )
     for label, done in results.items():
         console.print(f"  {label}: {_walked(verdict(done))}")
     if options.plot:
-        plots.learning(results, options.task).savefig(options.plot, dpi=150, bbox_inches="tight")
+        plots.sweep(results, options.task).savefig(options.plot, dpi=150, bbox_inches="tight")
         console.print(f"wrote {options.plot}")
 
 

@@ -199,3 +199,32 @@ def race(races: Sequence[dict[str, Any]], title: str) -> Figure:
     right.set(xlabel="minutes of collecting and learning")
     left.legend(loc="upper left")
     return figure
+
+
+@rc_context(STYLE)
+def sweep(results: Mapping[str, Sequence[dict[str, Any]]], title: str) -> Figure:
+    """Velocity error and falls of each setting's trainings against samples and seconds, of `telebip.tools.sweep.train_once`.
+
+    A line is a seed, a dot where it walks.
+    """
+    figure = Figure((9.2, 4.6), layout="constrained")
+    grid = figure.subplots(2, 2, sharex="col", sharey="row")
+    rows = {"velocity_error_mps": "velocity error [m/s]", "falls_per_minute": "falls per minute"}
+    columns = {"samples": "million samples", "seconds": "seconds of collecting and learning"}
+    for axes_row, (name, ylabel) in zip(grid, rows.items(), strict=True):
+        for axes, time in zip(axes_row, columns, strict=True):
+            for i, (label, seeds) in enumerate(results.items()):
+                for k, seed in enumerate(seeds):
+                    unit = 1e-6 if time == "samples" else 1.0
+                    x, y = unit * np.array(seed[time]), np.array(seed[name], dtype=float)
+                    axes.plot(x, y, color=COLORS[i % len(COLORS)], lw=1.0, label=label if k == 0 else None)
+                    if seed["walks"]:
+                        at = unit * seed["walks"][time]
+                        axes.plot(at, np.interp(at, x, y), "o", color=COLORS[i % len(COLORS)], ms=4)
+            axes.set_ylim(bottom=0.0)
+        axes_row[0].set_ylabel(ylabel)
+    for axes, xlabel in zip(grid[-1], columns.values(), strict=True):
+        axes.set_xlabel(xlabel)
+    grid[0, 0].set_title(title)
+    grid[0, 1].legend(loc="upper right")
+    return figure

@@ -12,6 +12,7 @@ from telebip.env import TelebipEnv
 from telebip.eval.conditions import as_evaluated, forward_commands, trained_speeds
 from telebip.eval.walk import heading_velocity
 from telebip.rl.policy import load_network
+from telebip.rl.process import random_state, set_random_state
 from telebip.rl.train import Trainer
 from telebip.robot import Robot
 from telebip.rollout import walk
@@ -85,6 +86,9 @@ class UntilWalking:
         """Return whether the policy walks; to be asked after every iteration."""
         iteration = self._trainer.iteration
         if self._passes < PASSES and iteration and iteration % EVERY == 0:
-            self.last = self._test.look(load_network(self._trainer.policy(), self._trainer.env.device))
+            device = self._trainer.env.device
+            random = random_state(device)
+            self.last = self._test.look(load_network(self._trainer.policy(), device))
+            set_random_state(random, device)  # a new network draws weights, before it is given others
             self._passes = self._passes + 1 if self.last.passed else 0
         return self._passes >= PASSES

@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from telebip.config import load_task
 from telebip.env import TelebipEnv
 from telebip.rl.learner import FIELDS
-from telebip.rl.networks import Gaussian
+from telebip.rl.networks import CpuElu, Gaussian
 from telebip.rl.ppo import FastPPO
 from telebip.rl.train import Trainer
 from telebip.robot import Robot
@@ -111,6 +111,31 @@ def test_the_product_says_what_it_computes_in(robot: Robot, precision: str) -> N
         torch.testing.assert_close(learner.actor(obs), exact, rtol=0.02, atol=0.02)
         assert learner.actor(obs).dtype == learner.critic(obs).dtype == torch.float32
     assert all(p.dtype == torch.float32 for p in learner.actor.parameters())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_an_elu_is_torchs_own(dtype: torch.dtype) -> None:
+    x = torch.cat([torch.linspace(-30.0, 30.0, 1001), torch.logspace(-6, -1, 100).neg()]).to(dtype)
+    gradient = torch.linspace(-2.0, 2.0, len(x)).to(dtype)
+    (own, theirs), values = (x.clone().requires_grad_() for _ in range(2)), []
+    for layer, given in ((CpuElu(), own), (torch.nn.ELU(), theirs)):
+        values.append(layer(given))
+        values[-1].backward(gradient)
+    assert values[0].dtype == dtype
+    torch.testing.assert_close(values[0], values[1], rtol=0.0, atol=2e-7)
+    torch.testing.assert_close(own.grad, theirs.grad, rtol=1e-6, atol=1e-6 if dtype == torch.float32 else 0.01)
+
+
+def test_an_update_waits_for_nothing_before_its_end(robot: Robot) -> None:
+    """On CUDA every number that is read back is a wait; the mean losses are, together, at the end."""
+    learner = rollout(robot)[0].learner
+    stock = stock_copy(learner)
+    with HostReads() as control:
+        stock.update()
+    assert "_local_scalar_dense" in control.seen
+    with HostReads() as reads:
+        learner.update()
+    assert reads.seen == []
 
 
 def test_a_rollout_reads_nothing_back_to_the_host(robot: Robot) -> None:
