@@ -79,6 +79,7 @@ class PpoConfig:
     gamma: Annotated[float, Quantity(ge=0, le=1)]
     lam: Annotated[float, Quantity(ge=0, le=1)]
     clip_param: Annotated[float, Quantity(gt=0)]
+    clip_value_loss: bool
     value_loss_coef: Annotated[float, Quantity(ge=0)]
     entropy_coef: Annotated[float, Quantity(ge=0)]
     max_grad_norm: Annotated[float, Quantity(gt=0)]
@@ -86,6 +87,7 @@ class PpoConfig:
     activation: Literal["elu", "relu", "selu", "tanh"]
     symmetry: Literal["none", "phase"]
     obs_normalization: bool
+    init_output_scale: Annotated[float, Quantity(ge=0)]
     init_std: Annotated[float, Quantity(gt=0)]
     min_std: Annotated[float, Quantity(gt=0)]
     final_min_std: Annotated[float, Quantity(gt=0)]

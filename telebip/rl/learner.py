@@ -53,6 +53,7 @@ def make_learner(
         RolloutStorage("rl", env.num_envs, ppo.num_steps_per_env, obs, [env.num_actions], device),
         device=device,
         multi_gpu_cfg=ranks.multi_gpu_cfg,
+        use_clipped_value_loss=ppo.clip_value_loss,
         **{name: getattr(ppo, name) for name in FIELDS},
     )
     if ranks.size > 1:

@@ -83,6 +83,9 @@ def make_networks(
     model = Bfloat16Model if arithmetic(ppo.mixed_precision, device) == "bfloat16" else MLPModel
     actor = model(obs, obs_groups, "actor", num_actions, **actor_cfg(ppo))
     critic = model(obs, obs_groups, "critic", 1, **critic_cfg(ppo))
+    with torch.no_grad():
+        for parameter in actor.mlp[-1].parameters():
+            parameter.mul_(ppo.init_output_scale)
     for network in (actor, critic):
         for i, layer in enumerate(network.mlp):
             if isinstance(layer, nn.ELU) and device.type == "cpu":

@@ -138,10 +138,13 @@ class FastPPO(PPO):
         return surrogate.detach(), entropy.detach()
 
     def _critic_gradient(self, b: MiniBatch) -> Tensor:
-        """Accumulate the gradient of the clipped value loss."""
+        """Accumulate the gradient of the value loss, clipped if so configured."""
         values = output(self.critic, b.critic_obs)
-        clipped = b.values + (values - b.values).clamp(-self.clip_param, self.clip_param)
-        loss = torch.max((values - b.returns).pow(2), (clipped - b.returns).pow(2)).mean()
+        squares = (values - b.returns).pow(2)
+        if self.use_clipped_value_loss:
+            clipped = b.values + (values - b.values).clamp(-self.clip_param, self.clip_param)
+            squares = torch.max(squares, (clipped - b.returns).pow(2))
+        loss = squares.mean()
         (self.value_loss_coef * loss).backward()
         return loss.detach()
 
