@@ -16,7 +16,7 @@ from telebip.errors import UserError
 from telebip.mdp.term import TERMS, Quantity, reward
 
 FLAT = load_task("telebip_flat")
-CHILDREN = ("telebip_backward", "telebip_efficient", "telebip_fast", "telebip_robust", "telebip_slow")
+CHILDREN = ("telebip_backward", "telebip_efficient", "telebip_fast", "telebip_quick", "telebip_robust", "telebip_slow")
 
 
 def leaves(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:

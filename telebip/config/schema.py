@@ -92,6 +92,7 @@ class PpoConfig:
     min_std: Annotated[float, Quantity(gt=0)]
     final_min_std: Annotated[float, Quantity(gt=0)]
     min_std_ramp: Samples
+    averaging: Annotated[float, Quantity(ge=0, le=1)]
     mixed_precision: Literal["auto", "always", "never"]
     save_interval: Annotated[int, Quantity(ge=1)]
     keep_checkpoints: Annotated[int, Quantity(ge=1)]

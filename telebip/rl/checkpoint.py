@@ -46,6 +46,11 @@ class Checkpoint:
     beside: tuple[int, ...] = ()  # iterations of all checkpoints that its folder had when it was loaded
 
     @property
+    def policy_weights(self) -> dict[str, Any]:
+        """The actor's weights to walk with: their average over the latest iterations, where the training has one."""
+        return self.learner.get("average_state_dict", self.learner["actor_state_dict"])
+
+    @property
     def is_onnx(self) -> bool:
         """Whether the file holds a policy exported to ONNX."""
         return self.path.suffix == ".onnx"

@@ -39,7 +39,7 @@ def load_network(checkpoint: Checkpoint, device: str | torch.device = "cpu") -> 
     obs = TensorDict({"policy": torch.zeros(1, width(layout, config, "policy"))}, batch_size=[1])
     actor = MLPModel(obs, obs_groups(layout), "actor", len(checkpoint.joint_names), **actor_cfg(config.ppo))
     try:
-        actor.load_state_dict(checkpoint.learner["actor_state_dict"])
+        actor.load_state_dict(checkpoint.policy_weights)
     except (RuntimeError, KeyError, TypeError, AttributeError) as error:
         raise UserError(f"checkpoint '{checkpoint.path}': its weights do not fit its configuration") from error
     policy = actor

@@ -67,4 +67,4 @@ def _write(folder: Path, checkpoint: Checkpoint) -> None:
 
 def policy_alone(checkpoint: Checkpoint) -> Checkpoint:
     """Return what is needed to walk, without what is needed to go on."""
-    return replace(checkpoint, learner={"actor_state_dict": checkpoint.learner["actor_state_dict"]}, training=[])
+    return replace(checkpoint, learner={"actor_state_dict": checkpoint.policy_weights}, training=[])

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from telebip.env import TelebipEnv
 from telebip.errors import UserError
+from telebip.rl.averaging import Average
 from telebip.rl.checkpoint import Checkpoint, robot_properties
 from telebip.rl.distributed import Ranks
 from telebip.rl.faults import dump_new_faults, ruined_networks, too_many_faults
@@ -55,6 +56,7 @@ class Trainer:
         self.view = SymmetricEnv(env) if ppo.symmetry == "phase" else env
         torch.manual_seed(env.cfg.seed)
         self.learner = make_learner(self.view, ppo, obs_groups(env.layout()), self.ranks, algorithm)
+        self._average = Average(ppo.averaging, self.learner.get_policy().state_dict())
         self._saver = Saver(self.ranks, env.device, ppo.keep_checkpoints, note)
         self._episodes = EpisodeStatistics(env.num_envs, env.device)
         # Spread the time-outs over the iterations.
@@ -79,6 +81,7 @@ class Trainer:
         require_complete(checkpoint)
         require_same(checkpoint, self.env)
         load_learner(self.learner, checkpoint, self.env.cfg.ppo)
+        self._average.load(checkpoint.policy_weights)
         self.iteration, self.samples = checkpoint.iteration, checkpoint.samples
         if len(checkpoint.training) != self.ranks.size:
             return f"the checkpoint has worlds of {len(checkpoint.training)} processes, this run has {self.ranks.size}"
@@ -139,6 +142,7 @@ class Trainer:
         learned = time.perf_counter()
 
         self.iteration += 1
+        self._average.add(learner.get_policy().state_dict(), self.iteration)
         batch = env.num_envs * cfg.num_steps_per_env * self.ranks.size
         self.samples += batch
         means = {key: value / cfg.num_steps_per_env for key, value in sums.items() if key not in counts}
@@ -172,7 +176,7 @@ class Trainer:
 
     def policy(self) -> Checkpoint:
         """Return the policy as it is now, on the CPU: what `policy.pt` would hold."""
-        weights = {name: value.cpu().clone() for name, value in self.learner.get_policy().state_dict().items()}
+        weights = {name: value.cpu().clone() for name, value in self._average.weights.items()}
         return self._checkpoint({"actor_state_dict": weights}, [])
 
     def checkpoint_bytes(self) -> int:
@@ -200,7 +204,8 @@ class Trainer:
     def _snapshot(self) -> Checkpoint:
         """Return all that it takes to go on bit for bit; every process has to call it."""
         own = {"env": self.env.state_dict(), "episodes": self._episodes.state_dict(), **random_state(self.env.device)}
-        return self._checkpoint(self.learner.save(), self.ranks.gather(own))
+        average = {"average_state_dict": self._average.weights} if self.env.cfg.ppo.averaging else {}
+        return self._checkpoint({**self.learner.save(), **average}, self.ranks.gather(own))
 
     def _checkpoint(self, learner: dict[str, Any], training: list[dict[str, Any]]) -> Checkpoint:
         env = self.env
