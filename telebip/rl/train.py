@@ -24,7 +24,7 @@ from telebip.rl.layout import obs_groups, seen
 from telebip.rl.learner import make_learner, set_min_std
 from telebip.rl.log import EpisodeStatistics, RunLog
 from telebip.rl.networks import arithmetic
-from telebip.rl.process import random_state, set_random_state
+from telebip.rl.process import random_state, set_random_state, threads_for
 from telebip.rl.resume import load_learner, require_complete, require_same
 from telebip.rl.saving import Saver
 from telebip.rl.symmetry import SymmetricEnv, joint_mirror
@@ -167,11 +167,12 @@ class Trainer:
             What is seen last, and the sums of what the environment logs, in the order of `env.log_names`.
         """
         logs = torch.zeros(len(self.env.log_names), device=self.env.device)
-        for _ in range(self.env.cfg.ppo.num_steps_per_env):
-            obs, rewards, dones, extras = self.view.step(self.learner.act(obs))
-            self.learner.process_env_step(obs, rewards, dones, extras)
-            self._episodes.add(rewards, dones)
-            logs += torch.stack(list(extras["log"].values()))
+        with threads_for(self.env.num_envs, self.env.device):
+            for _ in range(self.env.cfg.ppo.num_steps_per_env):
+                obs, rewards, dones, extras = self.view.step(self.learner.act(obs))
+                self.learner.process_env_step(obs, rewards, dones, extras)
+                self._episodes.add(rewards, dones)
+                logs += torch.stack(list(extras["log"].values()))
         return obs, logs
 
     def policy(self) -> Checkpoint:
