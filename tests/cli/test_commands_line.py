@@ -147,6 +147,20 @@ def test_a_trained_policy_can_be_played_and_recorded(run_dir: Path) -> None:
     assert record.stat().st_size > 10_000
 
 
+def test_a_training_looks_whether_it_walks_and_leaves_a_recording(tmp_path: Path) -> None:
+    small = ("--max-iterations", "11", "ppo.num_steps_per_env=2")
+    text = ran(TRAIN, "--task", "telebip_quick", "--until-walking", "--record", "--log-dir", str(tmp_path), *TINY, *small, run=fresh)
+    (run_dir,) = (tmp_path / "telebip_quick").iterdir()
+    lines = text.splitlines()
+    last = next(line for line in lines if line.lstrip().startswith("11/11"))
+    assert "last look" in last and "falls after 0." in last
+    assert f"rerun {run_dir / 'walk.rrd'}" in text and f"drew {run_dir / 'learning.png'}" in text
+    assert "it walks" not in text
+    for name in ("walk.rrd", "learning.png"):
+        assert (run_dir / name).stat().st_size > 10_000
+    assert (run_dir / "walk.png").exists() != ("note: no picture of it" in text)
+
+
 @pytest.mark.slow
 def test_pictures_are_made_anew(tmp_path: Path) -> None:
     text = ran(GALLERY, "--only", "control_loop.png", "stride.png", "--out", str(tmp_path), run=fresh)
