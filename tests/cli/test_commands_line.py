@@ -148,8 +148,8 @@ def test_a_trained_policy_can_be_played_and_recorded(run_dir: Path) -> None:
 
 
 def test_a_training_looks_whether_it_walks_and_leaves_a_recording(tmp_path: Path) -> None:
-    small = ("--max-iterations", "11", "ppo.num_steps_per_env=2")
-    text = ran(TRAIN, "--task", "telebip_quick", "--until-walking", "--record", "--log-dir", str(tmp_path), *TINY, *small, run=fresh)
+    small = (*TINY, "--max-iterations", "11", "ppo.num_steps_per_env=2", "--log-dir", str(tmp_path))
+    text = ran(TRAIN, "--task", "telebip_quick", "--until-walking", "--record", *small, run=fresh)
     (run_dir,) = (tmp_path / "telebip_quick").iterdir()
     lines = text.splitlines()
     last = next(line for line in lines if line.lstrip().startswith("11/11"))
