@@ -126,7 +126,6 @@ def train(
     ranks = Ranks.from_environment()
     console, is_watched = Console(quiet=not ranks.is_main), view.is_watched and ranks.is_main
     with console.status("loading torch and the physics engine"):
-        from telebip.eval.walking import UntilWalking
         from telebip.rl.process import keep_freed_memory
     if is_watched:
         from telebip.viz.rerun import require_viewer
@@ -149,7 +148,11 @@ def train(
             _prepare_folder(trainer, console)
         _announce(trainer, console, restart)
         asked = stack.enter_context(stop_on_signal(console))
-        walking = UntilWalking(trainer) if until_walking and ranks.is_main else None
+        walking = None
+        if until_walking and ranks.is_main:
+            from telebip.eval.walking import UntilWalking
+
+            walking = UntilWalking(trainer)
         report = stack.enter_context(progress_bar(console, trainer, walking))
         if is_watched:
             from telebip.viz.live import live_view

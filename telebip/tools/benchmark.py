@@ -83,7 +83,7 @@ class Stages:
         self._trainer = Trainer(env, "", Path())
         actor = self._trainer.learner.actor
         try:
-            actor.load_state_dict(checkpoint.learner["actor_state_dict"])
+            actor.load_state_dict(checkpoint.policy_weights)
         except (RuntimeError, KeyError) as error:
             raise UserError(f"checkpoint '{checkpoint.path}' holds no weights that fit the task's policy") from error
         self._weights = copy.deepcopy(self._trainer.learner.save())
