@@ -16,11 +16,13 @@ from telebip.mdp.actions import DelayLine, joint_targets, scales
 from telebip.mdp.binding import Binder, Events, model_fields_of, sensors_of
 from telebip.mdp.commands import hold_heading
 from telebip.mdp.faults import FaultRecorder
+from telebip.mdp.ground import Ground
 from telebip.mdp.groups import Group
 from telebip.mdp.step import EnvState, Step, World
 from telebip.mdp.terminations import non_finite
 from telebip.robot import Robot
 from telebip.sim import Backend, indexed, make_simulator
+from telebip.terrain import Terrain
 
 
 class Outcome(NamedTuple):
@@ -64,13 +66,13 @@ class TelebipEnv(VecEnv):
             UserError: a term does not fit the robot.
         """
         self.cfg: TaskConfig = check(cfg)
-        self.robot = robot
+        self.robot = robot.on(Terrain(cfg.terrain) if cfg.terrain.types else None)
         self.device: torch.device = indexed(torch.device(device))
         self.num_envs, self.num_actions = cfg.num_envs, len(robot.joint_names)
         self._keep_final_obs = keep_final_obs
         self.sim = make_simulator(
             backend,
-            robot,
+            self.robot,
             self.num_envs,
             cfg.sim.decimation,
             self.device,
@@ -83,6 +85,8 @@ class TelebipEnv(VecEnv):
         self.generator = torch.Generator(self.device).manual_seed(cfg.seed)
         self.world = self._make_world()
         self.state = EnvState.zeros(self.world)
+        if self.world.ground:
+            self.state.tile.copy_(self.world.ground.tiles(self.num_envs, cfg.terrain.start_level))
         self._given = zeros(self.num_envs, self.num_actions, device=self.device)  # the policy's actions as they came
         self._finite = self._everywhere()  # and whether they are numbers
         self._action = torch.zeros_like(self._given)  # A_t, zero where they are not
@@ -111,12 +115,14 @@ class TelebipEnv(VecEnv):
             device=self.device,
             step_dt=self.step_dt,
             decimation=cfg.sim.decimation,
+            episode_length=cfg.episode.length,
             gait_period=cfg.gait.period,
             home_qpos=constant(robot.home_qpos),
             nominal=constant(robot.nominal),
             force_limit=constant(robot.force_limit),
             action_scale=constant(scales(cfg.actions.scale, robot.joint_names)),
             foot_lift=constant(robot.foot_lift),
+            ground=Ground(robot.terrain, self.device) if robot.terrain else None,
             nominal_fields={name: field[0].clone() for name, field in self.sim.model_fields.items()},
         )
 
@@ -138,7 +144,8 @@ class TelebipEnv(VecEnv):
         self.state.reset(self._everywhere())  # of what finding the sizes has left
         self.reward_names = tuple(self._rewards)
         self.reward_terms = torch.zeros(len(self._rewards), self.num_envs, device=self.device)  # of the last step
-        self.log_names = log.names(self.reward_names, tuple(self._terminations))
+        types = self.world.ground.types if self.world.ground else ()
+        self.log_names = log.names(self.reward_names, tuple(self._terminations), types)
 
     def reset(self) -> TensorDict:
         """Start a new episode in every world and return its observation."""
@@ -228,7 +235,10 @@ class TelebipEnv(VecEnv):
         fault = faults.any(0)
         terminations = torch.stack([term(step) for term in self._terminations.values()] or [torch.zeros_like(fault)])
         step.fallen = terminations.any(0) | fault
-        time_outs = (state.episode_length >= self.max_episode_length) & ~step.fallen  # the learner bootstraps there
+        has_ended = state.episode_length >= self.max_episode_length
+        if ground := self.world.ground:
+            has_ended |= ground.distance(step.state.base_pos, state.tile) > 0.5 * ground.size
+        time_outs = has_ended & ~step.fallen  # the learner bootstraps there
         dones = step.fallen | time_outs
 
         # 3. Rewards. What a fault has made non-finite counts as zero, in its own world alone.
@@ -243,6 +253,7 @@ class TelebipEnv(VecEnv):
         if self._keep_final_obs:
             self._hold_heading(step)
             final_obs = self._observe(step)
+        self._events.happen("end", step, dones)
         obs = self._observe(self._reset(dones))
         final_obs = {name: torch.where(fault[:, None], obs[name], value) for name, value in final_obs.items()}
         return Outcome(obs, rewards.sum(0), dones, time_outs, logged, final_obs)
@@ -326,6 +337,8 @@ class TelebipEnv(VecEnv):
         self.state.reset(mask)
         before, reference = self.view(), self.state.reference_heading
         self._events.happen("reset", before, mask)
+        if self.world.ground:
+            before.start_qpos[:, :3] += self.world.ground.origin(self.state.tile)
         self.sim.reset(mask, before.start_qpos, before.start_qvel)
         step = self.view()
         torch.where(mask, step.heading, reference, out=reference)

@@ -3,7 +3,7 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +14,14 @@ from numpy.typing import NDArray
 from telebip import ROOT
 from telebip.errors import UserError, nearest
 from telebip.files import is_file
+from telebip.terrain import Terrain
 
 FEET = ("right_foot", "left_foot")
 """The order of all that is told of two feet: right first, as the phase signals (p_r, p_l)."""
 FOOT_SENSORS = tuple(f"{foot}_force" for foot in FEET)
 TRUNK, FLOOR, KEYFRAME = "trunk", "floor", "home"
+NET_FORCE = 3
+"""MuJoCo's number of a contact sensor's `reduce="netforce"`."""
 
 HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 MIRROR = np.array([1.0, -1.0, 1.0])
@@ -51,42 +54,88 @@ class Robot:
     joint_columns: slice | list[int]  # of the joints in `qpos`; in `qvel` they stand one column further left
     foot_lift: NDArray[np.float64]  # (2, num_joints) d(foot height) / d(joint position) in the home pose [m/rad | m/m]
     mirror: JointMirror | str  # at the plane y = 0; or which part is not its own mirror image
+    terrain: Terrain | None = None  # on which it stands; None: the floor of the file
 
     @property
     def physics_dt(self) -> float:
         """Physics step [s]."""
         return float(self.model.opt.timestep)
 
-    def engine_model(self, sensors: Sequence[str] = ()) -> mujoco.MjModel:
-        """Compile the file without what moves nothing and nobody reads, but costs the engine a seventh of every step.
+    def on(self, terrain: Terrain | None) -> "Robot":
+        """Return the same robot on a height field with its floor's friction and look, or on the floor of its file."""
+        if terrain is self.terrain:
+            return self
+        spec = mujoco.MjSpec.from_file(str(self.path))
+        if terrain:
+            _lay(spec, terrain)
+        return replace(self, model=spec.compile(), terrain=terrain)
 
-        These are sensors (an accelerometer alone takes a pass over the bodies), cameras, lights, geoms that collide with
-        nothing (inertias are computed before they go), and the search for constraint islands: one robot is one island. It
-        moves the same, bit for bit. Bodies, geoms and sensors may have other ids than in `model`: look them up by name.
+    def engine_model(self, sensors: Sequence[str] = ()) -> mujoco.MjModel:
+        """Compile the file, on its `terrain`, as an engine steps it: with `ground_force_sensor` of each foot.
+
+        It lacks what moves nothing and nobody reads, but costs the engine a seventh of every step: sensors (an accelerometer
+        alone takes a pass over the bodies), cameras, lights, geoms that collide with nothing (inertias are computed before),
+        and the search for constraint islands, as one robot is one island. It moves the same, bit for bit. Bodies, geoms and
+        sensors may have other ids than in `model`: look them up by name.
 
         Args:
-            sensors: names of the sensors to keep beside the feet's.
+            sensors: names of the sensors to keep.
 
         Raises:
             UserError: there is no such sensor, or without the rest the file is no valid MJCF.
         """
         spec = mujoco.MjSpec.from_file(str(self.path))
-        kept = [sensor for sensor in spec.sensors if sensor.name in (*FOOT_SENSORS, *sensors)]
+        kept = [sensor for sensor in spec.sensors if sensor.name in sensors]
         for name in sensors:
             if name not in [sensor.name for sensor in kept]:
                 known = (sensor.name for sensor in spec.sensors if sensor.name)
                 raise UserError(f"{self.path}: no sensor named '{name}'; {nearest(name, known)}")
         on_camera = any(mujoco.mjtObj.mjOBJ_CAMERA in (sensor.objtype, sensor.reftype) for sensor in kept)
         dropped = [sensor for sensor in spec.sensors if sensor not in kept]
+        for foot, touch in zip(FEET, FOOT_SENSORS, strict=True):
+            _sense_ground_force(spec, foot, spec.sensor(touch).objname)
         for part in (*dropped, *spec.lights, *([] if on_camera else spec.cameras)):
             spec.delete(part)
         # A rangefinder's rays end at geoms that collide with nothing, too.
         spec.compiler.discardvisual = all(sensor.type != mujoco.mjtSensor.mjSENS_RANGEFINDER for sensor in kept)
         spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
+        if self.terrain:
+            _lay(spec, self.terrain)
         try:
             return spec.compile()
         except ValueError as error:
             raise UserError(f"{self.path}: {error}") from error
+
+
+def _lay(spec: mujoco.MjSpec, terrain: Terrain) -> None:
+    """Make a height field of the floor; MuJoCo scales its data to 0..1."""
+    lowest, (rows, columns) = float(terrain.heights.min()), terrain.heights.shape
+    size = [*terrain.half_extent, max(float(np.ptp(terrain.heights)), 1e-6), 1.0]  # the last is its thickness below
+    spec.add_hfield(name=FLOOR, nrow=rows, ncol=columns, size=size, userdata=terrain.heights.astype(np.float32).ravel())
+    floor = spec.geom(FLOOR)
+    floor.type, floor.hfieldname, floor.pos = mujoco.mjtGeom.mjGEOM_HFIELD, FLOOR, [0.0, 0.0, lowest]
+
+
+def _sense_ground_force(spec: mujoco.MjSpec, foot: str, site: str) -> None:
+    """Add a contact sensor: the net force that a foot puts on the ground within its `site`, world frame [N], (3,).
+
+    Its vertical component means the same on every ground. A touch sensor adds the magnitudes of normal forces; on a height
+    field a foot touches several triangles at once, whose normals are tilted, and the sum is larger than what they carry.
+    """
+    spec.add_sensor(
+        name=ground_force_sensor(foot),
+        type=mujoco.mjtSensor.mjSENS_CONTACT,
+        objtype=mujoco.mjtObj.mjOBJ_SITE,
+        objname=site,
+        reftype=mujoco.mjtObj.mjOBJ_BODY,
+        refname="world",
+        intprm=[1 << mujoco.mjtConDataField.mjCONDATA_FORCE.value, NET_FORCE, 1],
+    )
+
+
+def ground_force_sensor(foot: str) -> str:
+    """Return the name of the sensor that `Robot.engine_model` has for a foot."""
+    return f"{foot}_ground_force"
 
 
 def load_robot(path: str | Path) -> Robot:

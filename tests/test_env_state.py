@@ -86,7 +86,7 @@ def test_a_reset_of_the_state_spares_other_worlds_and_what_lasts(make_env: MakeE
     mask = torch.tensor([True, False, True, False])
     env.state.reset(mask)
     lasting = {"held_wrench_w", "target_command", "command", "command_is_fixed", "reference_heading", "joint_target"}
-    lasting |= {"wrench_w", "random", "num_steps", "samples"}
+    lasting |= {"wrench_w", "random", "tile", "num_steps", "samples"}
     names = dict(env.state.items())
     assert lasting <= names.keys()
     for name, value in names.items():

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor
 from torch.utils import _pytree as pytree
 from torch.utils._python_dispatch import TorchDispatchMode
-from worlds import EVENTFUL, MORE_EVENTFUL, put_low, random_actions
+from worlds import EVENTFUL, MORE_EVENTFUL, ROUGH, put_low, random_actions
 
 from telebip import ROOT
 from telebip.config import load_task
@@ -20,7 +20,7 @@ from telebip.graph import CudaGraph, _no_garbage_collection
 from telebip.robot import Robot, load_robot
 from telebip.sim import indexed
 
-TASKS = pytest.mark.parametrize("task", [EVENTFUL, MORE_EVENTFUL], ids=["eventful", "more eventful"])
+TASKS = pytest.mark.parametrize("task", [EVENTFUL, MORE_EVENTFUL, ROUGH], ids=["eventful", "more eventful", "rough"])
 
 
 class Recording(TorchDispatchMode):

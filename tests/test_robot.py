@@ -135,7 +135,7 @@ def test_the_engines_model_has_the_same_bodies_and_only_what_the_physics_needs(r
     """That it moves the same, bit for bit, is in tests/sim/test_conformance.py."""
     model, engine = robot.model, robot.engine_model()
     assert [engine.geom(i).name for i in range(engine.ngeom)] == ["floor", "trunk", "right_foot", "left_foot"]
-    assert [engine.sensor(i).name for i in range(engine.nsensor)] == ["right_foot_force", "left_foot_force"]
+    assert [engine.sensor(i).name for i in range(engine.nsensor)] == ["right_foot_ground_force", "left_foot_ground_force"]
     assert (engine.ncam, engine.nlight) == (0, 0)
     assert (engine.nq, engine.nv, engine.nu, engine.nbody) == (model.nq, model.nv, model.nu, model.nbody)
     for name in ("body_mass", "body_inertia", "body_ipos", "body_iquat", "dof_armature", "dof_invweight0", "jnt_range"):
@@ -146,7 +146,7 @@ def test_the_engines_model_keeps_what_its_sensors_look_at(tmp_path: Path) -> Non
     more = """<rangefinder name="range" site="imu"/><framepos name="eye" objtype="camera" objname="track"/></sensor>"""
     robot = load_robot(edited(tmp_path, MJCF, {"</sensor>": more}))
     plain, seeing, eye = robot.engine_model(["gyro"]), robot.engine_model(["range"]), robot.engine_model(["eye"])
-    assert [plain.sensor(i).name for i in range(plain.nsensor)] == ["right_foot_force", "left_foot_force", "gyro"]
+    assert [plain.sensor(i).name for i in range(plain.nsensor)] == ["gyro", "right_foot_ground_force", "left_foot_ground_force"]
     assert seeing.ngeom == robot.model.ngeom > plain.ngeom  # rays end at what collides with nothing, too
     assert (eye.ncam, plain.ncam) == (1, 0)
 

@@ -30,6 +30,16 @@ MORE_EVENTFUL = (
     *("events.kick={lin_vel: 0.3, ang_vel: 1.0, interval: [0.06, 0.12]}", "events.mass={scale: [0.8, 1.2]}"),
 )
 """The same with what a task may have: a critic's group, histories, delays, kicks and masses."""
+ROUGH = (
+    *EVENTFUL,
+    "terrain.types.boxes={height: [0.0, 0.1], width: 0.4}",
+    "terrain.types.stairs_up={rise: [0.02, 0.1], tread: 0.3}",
+    "terrain.types.slope_down={angle: [0, 0.3]}",
+    *("terrain.levels=3", "terrain.start_level=[0,2]", "terrain.size=1.0", "terrain.platform=0.4", "events.terrain_level={}"),
+    "observations.critic={base_height: {}, height_scan: {forward: [-0.2, 0.4], aside: 0.2, spacing: 0.1, noise: 0.01}}",
+    *("sim.max_contacts=16", "sim.max_constraints=96"),
+)
+"""The same on rough ground, whose tiles are soon left."""
 
 
 def random_actions(steps: int, num_envs: int, scale: float = 1.0, seed: int = 0) -> Tensor:

@@ -1,13 +1,14 @@
 """Every section of a task, with the type, unit and bounds of its fields; no numbers, which stand in `configs/`.
 
-The fields of `observations`, `rewards`, `terminations` and `events` are the parameters of the functions that they name:
-see `telebip.mdp.term`.
+The fields of `terrain.types`, `observations`, `rewards`, `terminations` and `events` are the parameters of the functions that
+they name: see `telebip.mdp.term`.
 """
 
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from telebip.mdp.term import ObservationGroup, Params, Quantity
+from telebip.terrain import TerrainConfig
 
 Samples = Annotated[tuple[float, float], Quantity("samples", ge=0)]
 """Environment steps of all worlds together between which something grows, or falls."""
@@ -111,6 +112,7 @@ class TaskConfig:
     seed: Annotated[int, Quantity(ge=0, le=2**32 - 1)]
     num_envs: Annotated[int, Quantity(ge=1, le=2**24)]
     sim: SimConfig
+    terrain: TerrainConfig
     episode: EpisodeConfig
     gait: GaitConfig
     actions: ActionsConfig

@@ -16,7 +16,12 @@ from telebip.config.tree import Entry, Tree, entry_of, plain
 from telebip.errors import UserError, nearest
 from telebip.mdp.term import TERMS, Kind, ObservationGroup, Parameter, Params, Quantity, Term
 
-KINDS: dict[str, Kind] = {"rewards": "reward", "terminations": "termination", "events": "event"}
+KINDS: dict[str, Kind] = {
+    "rewards": "reward",
+    "terminations": "termination",
+    "events": "event",
+    "terrain.types": "terrain",
+}
 BOUNDS = {"gt": (">", operator.gt), "ge": (">=", operator.ge), "lt": ("<", operator.lt), "le": ("<=", operator.le)}
 GROUP_FIELDS = {f.name: Parameter.of(f.type, f.default) for f in dataclasses.fields(ObservationGroup) if f.name != "terms"}
 

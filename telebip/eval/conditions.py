@@ -25,6 +25,11 @@ def forward_commands(speeds: Sequence[float], worlds: int, device: torch.device)
     return torch.nn.functional.pad(forward[:, None], (0, 2))
 
 
+def on_flat_ground(config: TaskConfig) -> TaskConfig:
+    """Return a task on the floor of its MJCF."""
+    return replace(config, terrain=replace(config.terrain, types={}))
+
+
 def as_evaluated(
     config: TaskConfig, num_envs: int, duration: float, overrides: Sequence[str] = (), disturbed: bool = False
 ) -> TaskConfig:

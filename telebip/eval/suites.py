@@ -18,7 +18,8 @@ from telebip.control.factory import with_estimate
 from telebip.control.policy import Policy
 from telebip.env import TelebipEnv
 from telebip.errors import UserError, nearest
-from telebip.eval.conditions import SPEEDS, as_evaluated, forward_commands, trained_speeds
+from telebip.eval import terrain
+from telebip.eval.conditions import SPEEDS, as_evaluated, forward_commands, on_flat_ground, trained_speeds
 from telebip.eval.gait import summarise_gait
 from telebip.eval.learning import learning_curve
 from telebip.eval.push import PushProtocol, push_limits, push_trial
@@ -27,7 +28,7 @@ from telebip.robot import Robot
 from telebip.rollout import Rollout, roll_out
 from telebip.sim import Backend, choose_backend
 
-SUITES = ("tracking", "push", "gait", "learning")
+SUITES = ("tracking", "push", "gait", "terrain", "learning")
 Progress = Callable[[str, int, int], None]  # called with what is running, the finished steps and their total
 
 
@@ -98,6 +99,8 @@ def evaluate(
             results["gait"] = _gait(walks[command], robot, command, protocol.skip, candidate.task.gait.period)
     if "push" in suites:
         results["push"] = _push(candidate, robot, protocol, progress)
+    if "terrain" in suites:
+        results["terrain"] = _cross(candidate, robot, protocol, progress)
     if "learning" in suites:
         results["learning"] = curve
     return results
@@ -142,8 +145,8 @@ def commands_of(candidate: Candidate, protocol: Protocol) -> tuple[float, ...]:
 
 
 def make_env(candidate: Candidate, robot: Robot, protocol: Protocol, num_envs: int, duration: float) -> TelebipEnv:
-    """Create worlds of the candidate's task, undisturbed unless its overrides say otherwise; see `as_evaluated`."""
-    config = as_evaluated(candidate.config, num_envs, duration, candidate.overrides)
+    """Create worlds of the candidate's task on flat ground, undisturbed but for its overrides; see `as_evaluated`."""
+    config = as_evaluated(on_flat_ground(candidate.config), num_envs, duration, candidate.overrides)
     config = with_estimate(config) if candidate.is_model_based else config
     return TelebipEnv(config, robot, protocol.device, protocol.backend)
 
@@ -190,6 +193,19 @@ def _push(candidate: Candidate, robot: Robot, protocol: Protocol, progress: Prog
     name, total = f"pushing {push.num_envs} worlds", round(push.seconds / env.step_dt)
     survival = push_trial(env, candidate.make_policy(env), push, lambda step: progress(name, step, total))
     return {"protocol": asdict(push), **push_limits(survival, push, robot.weight)}
+
+
+def _cross(candidate: Candidate, robot: Robot, protocol: Protocol, progress: Progress) -> dict[str, Any]:
+    """Walk over every type and level of the terrain suite as one batch."""
+    speed = protocol.commands[0] if protocol.commands else trained_speeds(candidate.task)[0]
+    num_envs = protocol.worlds * terrain.LEVELS * len(terrain.TYPES)
+    config = terrain.on_test_ground(as_evaluated(candidate.config, num_envs, terrain.seconds(speed), candidate.overrides))
+    config = with_estimate(config) if candidate.is_model_based else config
+    env = TelebipEnv(config, robot, protocol.device, protocol.backend)
+    policy, name = candidate.make_policy(env), f"crossing terrain in {num_envs} worlds"
+    crossing = terrain.cross(env, policy, speed, lambda step, steps: progress(name, step, steps))
+    rows = terrain.levels_of(config, env, crossing)
+    return {"command_mps": speed, "limits": terrain.limits(rows), "levels": rows}
 
 
 def _speed_series(walks: dict[float, Rollout]) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import torch
 from telebip.config import TaskConfig
 from telebip.control.policy import Policy
 from telebip.env import TelebipEnv
-from telebip.eval.conditions import as_evaluated, forward_commands, trained_speeds
+from telebip.eval.conditions import as_evaluated, forward_commands, on_flat_ground, trained_speeds
 from telebip.eval.walk import heading_velocity
 from telebip.rl.policy import load_network
 from telebip.rl.process import random_state, set_random_state
@@ -48,12 +48,13 @@ class Look:
 
 
 class WalkingTest:
-    """The worlds of the short walk: undisturbed, without noise, at the speeds of the tracking suite that the task trains."""
+    """The worlds of the short walk: flat, undisturbed, without noise, at the speeds of the tracking suite that are trained."""
 
     def __init__(self, config: TaskConfig, robot: Robot, device: torch.device, backend: Backend = "auto") -> None:
         """Create `WORLDS` worlds for each speed."""
         self.commands = trained_speeds(config)
-        self._env = TelebipEnv(as_evaluated(config, WORLDS * len(self.commands), SECONDS), robot, device, backend)
+        config = as_evaluated(on_flat_ground(config), WORLDS * len(self.commands), SECONDS)
+        self._env = TelebipEnv(config, robot, device, backend)
 
     def look(self, policy: Policy) -> Look:
         """Walk `policy` from rest, until a world falls or `SECONDS` are over."""

@@ -89,7 +89,7 @@ class Events:
 
     def __init__(self, entries: dict[str, Params], binder: Binder) -> None:
         """Bind them."""
-        self._bound: dict[str, list[Bound]] = {"once": [], "reset": [], "step": []}
+        self._bound: dict[str, list[Bound]] = {"once": [], "reset": [], "end": [], "step": []}
         self.change_the_model = False
         for entry, params in entries.items():
             term = find_term("event", entry, params)
@@ -101,7 +101,7 @@ class Events:
             self.change_the_model |= term.fields is not None and when == "reset"
 
     def happen(self, when: str, step: Step, mask: Tensor | None = None) -> None:
-        """Let those that happen "once", at a "reset" or before a "step" happen, in the worlds of `mask`, or in all."""
+        """Let those of "once", "reset", "end" or "step" happen, in the worlds of `mask`, or in all."""
         everywhere = torch.ones_like(step.is_new) if mask is None else mask
         for bound in self._bound[when]:
             bound(step, everywhere)

@@ -1,8 +1,8 @@
 """What happens to the worlds: how they start, pushes, and what differs from world to world.
 
 An event is a function of the step and of a mask (num_envs,) of the worlds that it is for. A "reset" event may change
-`step.start_qpos` and `step.start_qvel`; one that declares `fields` may change `step.world.sim.model_fields`; a "step" event may
-call `step.push_force`.
+`step.start_qpos`, relative to the middle of the robot's tile, and `step.start_qvel`; an "end" event sees how an episode ended;
+one that declares `fields` may change `step.world.sim.model_fields`; a "step" event may call `step.push_force`.
 """
 
 import math
@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import torch
 from torch import Tensor
 
-from telebip.math import columns, turn
+from telebip.math import columns, norm, turn
 from telebip.mdp.curriculum import Ramp, progress
 from telebip.mdp.fields import nominal, rows_of, write
 from telebip.mdp.step import Memory, Step, World
@@ -116,6 +116,27 @@ def push(
     kept = torch.where(start[:, None], drawn, memory["force"])
     memory["force"].copy_(kept.masked_fill(time_left[:, None] < 0.5 * step.world.step_dt, 0.0))
     step.push_force(memory["force"])
+
+
+@event("end", random=lambda world: {"level": [(0.0, 1.0)]})
+def terrain_level(step: Step, mask: Tensor, random: Random) -> None:
+    """Let robots that cope go on to a harder level of their terrain, and those that do not to an easier one.
+
+    Up, where the robot has left its tile. Down, where it came less than half as far as commanded, or than the tile's edge, if
+    that is nearer. From beyond the last level back to any, so that none is forgotten. (legged_gym's game-inspired curriculum,
+    Rudin et al. 2021, https://arxiv.org/abs/2109.11978, section 3.2)
+    """
+    ground, tile = step.world.ground, step.env.tile
+    if ground is None:
+        return
+    edge, walked = 0.5 * ground.size, ground.distance(step.state.base_pos, tile)
+    commanded = norm(step.command[:, :2]) * step.world.episode_length
+    harder = (walked > edge) & ~step.fallen
+    easier = ~harder & (walked < 0.5 * commanded.clamp(max=edge))
+    level = tile[:, 1] + harder.long() - easier.long()
+    anywhere = (random["level"][:, 0] * ground.levels).long().clamp(max=ground.levels - 1)
+    level = torch.where(level < ground.levels, level.clamp(min=0), anywhere)
+    tile[:, 1] = torch.where(mask, level, tile[:, 1])
 
 
 @event("reset", "once", random=lambda world, *, range: {"friction": [range]}, fields=lambda **_: ("geom_friction",))

@@ -9,9 +9,9 @@ from torch import Tensor
 from telebip.errors import UserError
 from telebip.math import columns
 from telebip.mdp.binding import Binder, Bound, find_term, own
-from telebip.mdp.mirror import Image, image_of
+from telebip.mdp.mirror import image_of
 from telebip.mdp.step import Step
-from telebip.mdp.term import Mirror, ObservationGroup, Params
+from telebip.mdp.term import Image, Mirror, ObservationGroup, Params
 
 AXES: dict[Mirror, tuple[str, ...]] = {
     **{"polar": ("x", "y", "z"), "axial": ("x", "y", "z"), "quat": ("w", "x", "y", "z")},
@@ -96,7 +96,7 @@ def _part(where: str, entry: str, params: Params, has_noise: bool, bound: Bound,
         raise UserError(f"{where} must return (num_envs, size), got {found}")
     term, robot, size = find_term("observation", entry, params), step.world.robot, value.shape[1]
     mirror = term.mirror(**own(term, params)) if callable(term.mirror) else term.mirror
-    names = robot.joint_names if mirror == "joints" else AXES.get(mirror, ())
+    names = robot.joint_names if mirror == "joints" else AXES.get(mirror, ()) if isinstance(mirror, str) else ()
     axes = names if len(names) == size else tuple(map(str, range(size)))
     noise = params["noise"] if has_noise else 0.0
     return Part(entry, size, term.unit, axes, image_of(mirror, size, robot), noise)

@@ -4,11 +4,8 @@ The image of x is sign * x[order]. A vector that points somewhere (polar) change
 and changes the others. What becomes of the joints is read from the MJCF, `telebip.robot.JointMirror`.
 """
 
-from telebip.mdp.term import Mirror
+from telebip.mdp.term import Image, Mirror
 from telebip.robot import Robot
-
-Image = tuple[list[int], list[float]]
-"""Which entry takes each place, and its sign."""
 
 IMAGES: dict[Mirror, Image] = {
     "polar": ([0, 1, 2], [1.0, -1.0, 1.0]),
@@ -19,8 +16,10 @@ IMAGES: dict[Mirror, Image] = {
 }
 
 
-def image_of(mirror: Mirror, size: int, robot: Robot) -> Image | str:
+def image_of(mirror: Mirror | Image, size: int, robot: Robot) -> Image | str:
     """Return how `size` numbers of a kind are mirrored, or why they cannot be."""
+    if isinstance(mirror, tuple):
+        return mirror
     if mirror == "none":
         return "it declares no mirror image"
     if mirror == "same":

@@ -4,12 +4,13 @@ A task lists the terms of a group in the order in which they are seen. A term de
 it (`telebip.mdp.mirror`); its size is that of what it returns.
 """
 
-from typing import Literal
+from typing import Annotated, Literal
 
+import torch
 from torch import Tensor
 
 from telebip.mdp.step import Step
-from telebip.mdp.term import observation
+from telebip.mdp.term import Image, Quantity, observation
 from telebip.robot import FLOOR
 
 
@@ -92,8 +93,45 @@ def push_force(step: Step) -> Tensor:
 
 @observation(unit="m above the ground", mirror="same")
 def base_height(step: Step) -> Tensor:
-    """Height of the trunk's frame, midway between the hips [m], (num_envs, 1)."""
-    return step.state.base_pos[:, 2:3]
+    """Height of the trunk's frame, midway between the hips, above the ground below it [m], (num_envs, 1)."""
+    return step.base_height[:, None]
+
+
+def _scan_size(*, forward: tuple[float, float], aside: float, spacing: float) -> tuple[int, int]:
+    """Return how many points a scan has along the heading, and how many across it."""
+    return round((forward[1] - forward[0]) / spacing) + 1, 2 * round(aside / spacing) + 1
+
+
+def _scan_image(**parameters) -> Image:
+    """Right and left change places in each row of a scan."""
+    rows, across = _scan_size(**parameters)
+    return [row * across + i for row in range(rows) for i in reversed(range(across))], [1.0] * (rows * across)
+
+
+@observation(
+    unit="m, ground relative to the trunk's frame, point by point from back to front, from right to left", mirror=_scan_image
+)
+def height_scan(
+    step: Step,
+    *,
+    forward: Annotated[tuple[float, float], Quantity("m", ge=-5, le=5)],
+    aside: Annotated[float, Quantity("m", ge=0, le=5)],
+    spacing: Annotated[float, Quantity("m", ge=0.01, le=5)],
+) -> Tensor:
+    """Heights of the ground around the robot, relative to the trunk's frame [m], (num_envs, points).
+
+    Args:
+        step: the present step.
+        forward: from where to where along the robot's heading [m].
+        aside: how far to each side of it [m].
+        spacing: between neighbouring points [m].
+    """
+    rows, across = _scan_size(forward=forward, aside=aside, spacing=spacing)
+    point = torch.arange(rows * across, device=step.world.device)
+    ahead, left = forward[0] + spacing * (point // across), spacing * (point % across - across // 2)
+    x, y, z = step.state.base_pos[:, :, None].unbind(1)  # (num_envs, 1) each
+    c, s = torch.cos(step.heading)[:, None], torch.sin(step.heading)[:, None]
+    return step.ground_height(x + c * ahead - s * left, y + s * ahead + c * left) - z
 
 
 @observation(unit="as the MJCF's sensor", mirror=lambda *, sensor, mirror: mirror, sensors=lambda *, sensor, mirror: (sensor,))

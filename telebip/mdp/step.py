@@ -11,6 +11,7 @@ from torch import Tensor
 
 from telebip.math import over, rotate_inverse, turn, yaw, zeros
 from telebip.mdp.gait import phase_signals
+from telebip.mdp.ground import Ground
 from telebip.robot import Robot
 from telebip.sim.base import SimState, Simulator
 
@@ -28,12 +29,14 @@ class World:
     device: torch.device
     step_dt: float  # policy step [s]
     decimation: int  # physics steps per policy step
+    episode_length: float  # until the time-out [s]
     gait_period: float  # T [s]
     home_qpos: Tensor  # (nq,)
     nominal: Tensor  # joint positions of the home pose [rad | m], (num_joints,)
     force_limit: Tensor  # of the actuators [N m | N], (num_joints,)
     action_scale: Tensor  # displacement of a joint target per unit of action [rad | m], (num_joints,)
     foot_lift: Tensor  # by how much each foot rises with each joint in the home pose [m/rad | -], (2, num_joints)
+    ground: Ground | None  # None where it is flat, at height 0
     nominal_fields: Mapping[str, Tensor]  # the MJCF's values of `sim.model_fields`, without a dimension for the worlds
 
     @property
@@ -77,6 +80,7 @@ class EnvState:
     joint_target: Tensor = lasting()  # of the last step [rad | m], (num_envs, num_joints)
     wrench_w: Tensor = lasting()  # on the trunk's centre of mass in the last step, world frame [N, N m], (num_envs, 6)
     random: Tensor = lasting()  # the step's random numbers, (num_envs, numbers)
+    tile: Tensor = lasting()  # (type, level) of the terrain on which each robot starts, (num_envs, 2) long
     num_steps: Tensor = lasting()  # since the worlds were made, () long
     samples: Tensor = lasting()  # of the training so far, where the curriculum stands; infinite where it is complete, ()
     memory: dict[str, Memory] = field(default_factory=dict)  # of each term: "rewards.foot", say
@@ -98,6 +102,7 @@ class EnvState:
             joint_target=world.zeros(world.num_joints),
             wrench_w=world.zeros(6),
             random=world.zeros(0),
+            tile=zeros(world.num_envs, 2, device=device).long(),
             num_steps=torch.zeros((), dtype=torch.long, device=device),
             samples=torch.full((), torch.inf, device=device),
         )
@@ -169,6 +174,16 @@ class Step:
     def phase(self) -> Tensor:
         """Phase signals (p_r, p_l) [-], (num_envs, 2)."""
         return phase_signals(self.time, self.world.gait_period)
+
+    @cached_property
+    def base_height(self) -> Tensor:
+        """Height of the trunk's frame, midway between the hips, above the ground below it [m], (num_envs,)."""
+        x, y, z = self.state.base_pos.unbind(1)
+        return z - self.ground_height(x, y)
+
+    def ground_height(self, x: Tensor, y: Tensor) -> Tensor:
+        """Return the height of the ground at points of the world [m], (...)."""
+        return self.world.ground.height(x, y) if self.world.ground else torch.zeros_like(x)
 
     @cached_property
     def base_lin_vel_b(self) -> Tensor:

@@ -24,10 +24,12 @@ from telebip.errors import UserError, nearest
 Params = dict[str, Any]
 """A term's parameters by name, as YAML gives them; the key `term` names the function where the entry has another name."""
 
-Kind = Literal["observation", "reward", "termination", "event"]
-When = Literal["reset", "once", "interval", "step"]
+Kind = Literal["observation", "reward", "termination", "event", "terrain"]
+When = Literal["reset", "end", "once", "interval", "step"]
 Mirror = Literal["joints", "polar", "axial", "quat", "command", "feet", "same", "none"]
 """How an observation is mirrored at the plane y = 0, see `telebip.mdp.mirror`."""
+Image = tuple[list[int], list[float]]
+"""A mirror image in numbers: which entry takes each place, and its sign."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +69,7 @@ class Term:
     memory: Callable[..., Mapping[str, Any]] | None = None  # (world, **parameters) -> tensors
     random: Callable[..., Mapping[str, list[tuple[float, float]]]] | None = None  # (world, **parameters) -> ranges
     unit: str = ""  # of an observation
-    mirror: Mirror | Callable[..., Mirror] = "none"  # of an observation, or (**parameters) -> that
+    mirror: Mirror | Callable[..., Mirror | Image] = "none"  # of an observation, or (**parameters) -> that
     sensors: Callable[..., tuple[str, ...]] | None = None  # of an observation: (**parameters) -> sensors of the MJCF
     when: tuple[When, ...] = ()  # of an event: when it may happen, the usual one first
     fields: Callable[..., tuple[str, ...]] | None = None  # of an event: (**parameters) -> fields of the model that it writes
@@ -109,6 +111,7 @@ _COMMON: dict[Kind, dict[str, Parameter]] = {
     "reward": {},
     "termination": {},
     "event": {},
+    "terrain": {},
 }
 """Parameters that every term of a kind has; they are not passed to its function."""
 
@@ -134,7 +137,7 @@ class ObservationGroup:
     noise: bool = True  # whether the terms' noise is on
 
 
-TERMS: dict[Kind, dict[str, Term]] = {"observation": {}, "reward": {}, "termination": {}, "event": {}}
+TERMS: dict[Kind, dict[str, Term]] = {"observation": {}, "reward": {}, "termination": {}, "event": {}, "terrain": {}}
 """Every term that there is, by kind and name; the decorators below enter them."""
 
 
@@ -171,12 +174,17 @@ def event(*when: When, **about: Any) -> Callable[[Callable[..., Any]], Callable[
     """Let tasks name a function (step, mask, **parameters) -> None in their `events`; it changes worlds in place.
 
     Args:
-        when: "reset", in the worlds that begin an episode; "once", in all worlds, as they are made; "interval", in the worlds
-            whose time has come, every `interval` [s] of a range; "step", in all worlds, before each step. With several, the
-            YAML's `when` chooses.
+        when: "reset", in the worlds that begin an episode; "end", in those that end one, before anything is reset; "once",
+            in all worlds, as they are made; "interval", in the worlds whose time has come, every `interval` [s] of a range;
+            "step", in all worlds, before each step. With several, the YAML's `when` chooses.
         about: `memory`, `random`, `fields` and `is_disturbance` of `Term`.
     """
     return lambda function: _enter("event", function, {"when": when, "is_disturbance": True, **about})
+
+
+def terrain(function: Callable[..., Any] | None = None, /, **about: Any) -> Any:
+    """Let tasks name a function (tile, **parameters) -> heights in their `terrain.types`, see `telebip.terrain`."""
+    return _enter("terrain", function, about)
 
 
 def _enter(kind: Kind, function: Callable[..., Any] | None, about: dict[str, Any]) -> Any:

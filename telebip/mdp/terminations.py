@@ -12,8 +12,8 @@ from telebip.sim.base import SimState
 
 @termination
 def fallen(step: Step, *, min_hip_height: Annotated[float, Quantity("m", ge=0)]) -> Tensor:
-    """Whether the hips are below `min_hip_height` [m]: bool, (num_envs,). The trunk's frame lies midway between them."""
-    return step.state.base_pos[:, 2] < min_hip_height
+    """Whether the hips are lower than `min_hip_height` [m] above the ground: bool, (num_envs,)."""
+    return step.base_height < min_hip_height
 
 
 @termination

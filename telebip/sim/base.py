@@ -34,7 +34,7 @@ class SimState:
 
     qpos: Tensor  # (num_envs, nq): trunk position [m] and quaternion, then the other joints' positions [rad | m]
     qvel: Tensor  # (num_envs, nv): trunk velocity, world frame [m/s], angular velocity, body frame [rad/s], then the others'
-    foot_force: Tensor  # (num_envs, 2): normal ground force on the right and the left foot [N]
+    foot_force: Tensor  # (num_envs, 2): vertical force of the ground on the right and the left foot [N]
     joint_force: Tensor  # (num_envs, num_joints): actuator force [N m | N]
     joint_power: Tensor  # (num_envs, num_joints): |actuator force x joint velocity| [W]
     joint_net_power: Tensor  # (num_envs, num_joints): the same with its sign, negative where the actuator brakes [W]

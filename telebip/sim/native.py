@@ -10,7 +10,7 @@ import torch
 from mujoco.batch import Batch, SimulationError
 from torch import Tensor
 
-from telebip.robot import FOOT_SENSORS, TRUNK, Robot
+from telebip.robot import FEET, TRUNK, Robot, ground_force_sensor
 from telebip.sim.base import ENGINE_FAULTS, Backend, SimState, derives, state_fields
 
 CAPACITY = [mujoco.mjtWarning.mjWARN_CONTACTFULL.value, mujoco.mjtWarning.mjWARN_CNSTRFULL.value]
@@ -53,7 +53,7 @@ class NativeSimulator:
         sizes = {"actuator_force": self.model.nu, "actuator_velocity": self.model.nu, "sensordata": self.model.nsensordata}
         self._record = {name: np.zeros((num_envs, decimation, size)) for name, size in sizes.items()}
         self._force, self._velocity, data = (torch.from_numpy(values) for values in self._record.values())
-        self._feet = [data[:, :, self.model.sensor(name).adr[0]] for name in FOOT_SENSORS]
+        self._feet = [data[:, :, self.model.sensor(ground_force_sensor(foot)).adr[0] + 2] for foot in FEET]
         places = {name: self.model.sensor(name) for name in sensors}
         self._sensors = {name: data[:, -1, place.adr[0] : place.adr[0] + place.dim[0]] for name, place in places.items()}
         home = torch.from_numpy(robot.home_qpos).float().expand(num_envs, -1)
@@ -74,7 +74,7 @@ class NativeSimulator:
         state.qpos.copy_(memory["qpos"])
         state.qvel.copy_(memory["qvel"])
         for column, foot in zip(state.foot_force.T, self._feet, strict=True):
-            column.copy_(_mean(foot))
+            column.copy_(-_mean(foot))
         state.joint_force.copy_(_mean(self._force))
         power = self._force * self._velocity
         state.joint_net_power.copy_(_mean(power))

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from telebip.errors import UserError
 from telebip.math import over
-from telebip.robot import FOOT_SENSORS, TRUNK, Robot
+from telebip.robot import FEET, TRUNK, Robot, ground_force_sensor
 from telebip.sim.base import ENGINE_FAULTS, MEANS, Backend, SimState, derives, state_fields
 
 CAPACITY = int(mjw.OverflowType.ALL & ~(mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS))
@@ -48,8 +48,8 @@ def _accumulate(
     joint_power[world, i] += scale * wp.abs(power)
     joint_net_power[world, i] += scale * power
     if i == 0:
-        foot_force[world, 0] += scale * sensordata[world, right_adr]
-        foot_force[world, 1] += scale * sensordata[world, left_adr]
+        foot_force[world, 0] -= scale * sensordata[world, right_adr]
+        foot_force[world, 1] -= scale * sensordata[world, left_adr]
 
 
 class WarpSimulator:
@@ -113,7 +113,7 @@ class WarpSimulator:
         self._ctrl, self._overflow = wp.to_torch(data.ctrl), wp.to_torch(data.overflow)
         self._targets = [wp.to_torch(controls) for controls in self._schedule]
         self._trunk_wrench = wp.to_torch(data.xfrc_applied)[:, self.model.body(TRUNK).id]
-        self._foot_adr = [int(self.model.sensor(name).adr[0]) for name in FOOT_SENSORS]
+        self._foot_adr = [int(self.model.sensor(ground_force_sensor(foot)).adr[0]) + 2 for foot in FEET]
         self.advice = {
             "capacity": f"raise sim.max_contacts ({max_contacts}) or sim.max_constraints ({max_constraints}), both per world"
         }

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from telebip.mdp.binding import Binder, Bound
+from telebip.mdp.ground import Ground
 from telebip.mdp.step import EnvState, Step, World
 from telebip.mdp.term import Kind
 from telebip.robot import Robot
@@ -40,12 +41,14 @@ def make_world(robot: Robot, num_envs: int = 1, gait_period: float = 0.5, fields
         device=CPU,
         step_dt=0.02,
         decimation=4,
+        episode_length=10.0,
         gait_period=gait_period,
         home_qpos=torch.as_tensor(robot.home_qpos).float(),
         nominal=torch.as_tensor(robot.nominal).float(),
         force_limit=torch.as_tensor(robot.force_limit).float(),
         action_scale=SCALE,
         foot_lift=torch.as_tensor(robot.foot_lift).float(),
+        ground=Ground(robot.terrain, CPU) if robot.terrain else None,
         nominal_fields=nominal_fields,
     )
 

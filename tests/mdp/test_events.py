@@ -1,6 +1,7 @@
 """What happens to the worlds: how they start, pushes and kicks, and what differs from world to world."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -9,11 +10,13 @@ from steps import again, bind, everywhere, fills, make_step
 from torch import Tensor
 
 from telebip import ROOT
+from telebip.config import load_task
 from telebip.errors import UserError
 from telebip.math import yaw
 from telebip.mdp.binding import Binder, Events, model_fields_of
 from telebip.mdp.step import Step
 from telebip.robot import Robot, load_robot
+from telebip.terrain import Terrain
 
 POSE = {"joint_pos": 0.02, "heading": math.pi}
 VELOCITY = {"joint_vel": 0.1, "lin_vel": 0.2, "ang_vel": 0.3}
@@ -326,3 +329,50 @@ def test_when_an_event_happens_is_the_task_s_choice(robot: Robot) -> None:
     assert len(fields["geom_friction"][:, robot.floor_id, 0].unique()) == 4
     events.happen("once", step)
     assert len(fields["body_mass"][:, robot.trunk_id].unique()) == 4
+
+
+def on_tiles(robot: Robot, tiles: list[list[int]], away: list[tuple[float, float]]) -> Step:
+    """Robots on tiles (type, level) of 6 m, three levels, that far away from their middles; commanded 0.5 m/s for 10 s."""
+    terrain = replace(
+        load_task("telebip_flat").terrain,
+        types={"boxes": {"height": (0.0, 0.0), "width": 0.4}, "waves": {"height": (0.0, 0.0), "length": 1.0}},
+        levels=3,
+        start_level=(0, 2),
+    )
+    step = make_step(robot.on(Terrain(terrain)), len(tiles))
+    assert step.world.ground
+    step.env.tile[:] = torch.tensor(tiles)
+    step.env.command[:, 0] = 0.5
+    step.state.qpos[:, :2] = step.world.ground.origin(step.env.tile)[:, :2] + torch.tensor(away)
+    return step
+
+
+def test_the_level_goes_up_where_the_tile_is_left_and_down_where_the_robot_comes_not_half_as_far(robot: Robot) -> None:
+    tiles = [[0, 1], [1, 1], [0, 1], [1, 1], [0, 0], [0, 1], [0, 1]]
+    away = [(3.1, 0.0), (0.5, -3.1), (1.4, 0.0), (1.6, 0.0), (0.0, 0.0), (3.1, 0.0), (3.1, 0.0)]
+    step = on_tiles(robot, tiles, away)
+    step.fallen[5] = True  # it has left its tile, but it fell
+    mask = everywhere(step)
+    mask[6] = False
+    bind(step, "event", "terrain_level")(step, mask)
+    assert step.env.tile.tolist() == [[0, 2], [1, 2], [0, 0], [1, 1], [0, 0], [0, 1], [0, 1]]
+
+
+def test_a_robot_that_is_to_stand_keeps_its_level(robot: Robot) -> None:
+    step = on_tiles(robot, [[0, 1], [0, 1]], [(0.0, 0.0), (0.3, 0.0)])
+    step.env.command[:, 0] = torch.tensor([0.0, 0.05])  # half of 0.5 m is less than 0.3 m
+    bind(step, "event", "terrain_level")(step, everywhere(step))
+    assert step.env.tile[:, 1].tolist() == [1, 1]
+
+
+def test_from_the_last_level_it_goes_back_to_any(robot: Robot) -> None:
+    step = on_tiles(robot, [[0, 2]] * 600, [(3.1, 0.0)] * 600)
+    bind(step, "event", "terrain_level")(step, everywhere(step))
+    counts = torch.bincount(step.env.tile[:, 1], minlength=3)
+    assert len(counts) == 3 and counts.min() > 150
+
+
+def test_on_flat_ground_there_are_no_levels(robot: Robot) -> None:
+    step = make_step(robot, 2)
+    bind(step, "event", "terrain_level")(step, everywhere(step))
+    assert not step.env.tile.any()

@@ -23,6 +23,7 @@ from telebip.mdp.step import Step
 from telebip.mdp.term import TERMS, find
 from telebip.robot import Robot
 from telebip.sim.base import SimState, columns_on
+from telebip.terrain import Terrain
 
 few = settings(max_examples=50, deadline=None, derandomize=True, database=None)
 turns = st.floats(-2 * math.pi, 2 * math.pi)
@@ -248,3 +249,51 @@ def test_every_observation_says_its_unit_and_how_it_is_mirrored() -> None:
         if term.function.__module__ == observations.__name__:
             assert term.unit, name
             assert term.mirror != "none", name
+
+
+SCAN = {"forward": (-0.2, 0.4), "aside": 0.1, "spacing": 0.1}
+
+BELOW = 0.1 * (1.0 - 0.5) - 0.1 * (2.975 - 0.5)  # half a metre from the platform; at the tile's edge the ground is at 0
+
+
+def on_a_slope(robot: Robot) -> Step:
+    """Robots at x = 1 m on ground that rises with x by 0.1 m a metre: one heading along x, the other along y."""
+    slope = {"slope_up": {"angle": (math.atan(0.1), math.atan(0.1))}}
+    terrain = replace(load_task("telebip_flat").terrain, types=slope, levels=1, start_level=(0, 0))
+    step = make_step(robot.on(Terrain(terrain)), num_envs=2)
+    step.state.qpos[:, :3] = torch.tensor([1.0, 0.0, 0.7])
+    step.state.qpos[1, 3:7] = torch.tensor([math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)])
+    return step
+
+
+def test_a_height_scan_turns_with_the_heading(robot: Robot) -> None:
+    step = on_a_slope(robot)
+    scan = observations.height_scan(step, **SCAN)
+    assert scan.shape == (2, 7 * 3)
+    below = BELOW - 0.7
+    ahead, aside = torch.linspace(-0.2, 0.4, 7)[:, None], torch.linspace(-0.1, 0.1, 3)
+    torch.testing.assert_close(scan[0].view(7, 3), below + 0.1 * ahead.expand(7, 3), atol=1e-4, rtol=0.0)
+    torch.testing.assert_close(
+        scan[1].view(7, 3), below - 0.1 * aside.expand(7, 3), atol=1e-4, rtol=0.0
+    )  # uphill is on the right
+
+
+def test_a_height_scan_of_flat_ground_is_the_height_of_the_trunk(robot: Robot) -> None:
+    step = make_step(robot, num_envs=2)
+    torch.testing.assert_close(observations.height_scan(step, **SCAN), torch.full((2, 21), -0.66))
+
+
+def test_the_mirror_image_of_a_height_scan_swaps_right_and_left(robot: Robot) -> None:
+    step = on_a_slope(robot)
+    group = Group("policy", ObservationGroup({"height_scan": {**SCAN, "noise": 0.0}}), Binder(step))
+    (image,) = (part.image for part in group.parts)
+    assert not isinstance(image, str)
+    order, sign = image
+    seen = group.observe(step)[1]
+    assert sign == [1.0] * 21
+    torch.testing.assert_close(seen[order].view(7, 3), seen.view(7, 3).flip(1))
+
+
+def test_heights_are_above_the_ground(robot: Robot) -> None:
+    height = observations.base_height(on_a_slope(robot))
+    torch.testing.assert_close(height, torch.full((2, 1), 0.7 - BELOW), atol=1e-4, rtol=0.0)
