@@ -14,7 +14,7 @@ from telebip.math import wrap_angle, zeros
 from telebip.mdp import log
 from telebip.mdp.actions import DelayLine, joint_targets, scales
 from telebip.mdp.binding import Binder, Events, model_fields_of, sensors_of
-from telebip.mdp.commands import hold_heading
+from telebip.mdp.commands import VelocityCommands, hold_heading
 from telebip.mdp.faults import FaultRecorder
 from telebip.mdp.ground import Ground
 from telebip.mdp.groups import Group
@@ -139,7 +139,15 @@ class TelebipEnv(VecEnv):
             name: binder.bind("termination", "terminations", name, params) for name, params in cfg.terminations.items()
         }
         self._events = Events(cfg.events, binder)
-        self._drawn_commands = binder.random("commands", {"command": list(cfg.commands.ranges)})
+        self._commands = VelocityCommands(
+            binder,
+            cfg.commands.ranges,
+            cfg.commands.resampling_time,
+            standing=cfg.commands.rel_standing_envs,
+            forward=cfg.commands.rel_forward_envs,
+            heading=cfg.commands.rel_heading_envs,
+            heading_stiffness=cfg.commands.heading_control_stiffness,
+        )
         self._random = binder.allocate()
         self.state.reset(self._everywhere())  # of what finding the sizes has left
         self.reward_names = tuple(self._rewards)
@@ -342,16 +350,9 @@ class TelebipEnv(VecEnv):
         self.sim.reset(mask, before.start_qpos, before.start_qvel)
         step = self.view()
         torch.where(mask, step.heading, reference, out=reference)
-        self._update_commands(step)
-        return step
-
-    def _update_commands(self, step: Step) -> None:
-        """Give a new command where the last one has expired, and bring the heading hold up to date."""
-        state = self.state
-        due = (state.command_timer < 0.5 * self.step_dt) & ~state.command_is_fixed
-        torch.where(due[:, None], self._drawn_commands["command"], state.target_command, out=state.target_command)
-        state.command_timer.masked_fill_(due, self.cfg.commands.resampling_time)
+        self._commands.update(step)
         self._hold_heading(step)
+        return step
 
     def _hold_heading(self, step: Step) -> None:
         """Turn the target command's yaw rate towards the reference heading."""

@@ -13,6 +13,9 @@ from telebip.terrain import TerrainConfig
 Samples = Annotated[tuple[float, float], Quantity("samples", ge=0)]
 """Environment steps of all worlds together between which something grows, or falls."""
 
+Share = Annotated[float, Quantity(ge=0, le=1)]
+"""Of all commands."""
+
 
 @dataclass(frozen=True)
 class SimConfig:
@@ -56,6 +59,10 @@ class CommandsConfig:
     lin_vel_y: Annotated[tuple[float, float], Quantity("m/s")]
     ang_vel_z: Annotated[tuple[float, float], Quantity("rad/s")]
     resampling_time: Annotated[float, Quantity("s", gt=0)]
+    rel_standing_envs: Share
+    rel_forward_envs: Share
+    rel_heading_envs: Share
+    heading_control_stiffness: Annotated[float, Quantity("1/s", ge=0)]
     heading_gain: Annotated[float, Quantity("1/s", ge=0)]
     heading_limit: Annotated[float, Quantity("rad/s", ge=0)]
 

@@ -1,11 +1,17 @@
-"""How the heading hold bends the velocity command."""
+"""Which commands are given, and how the heading hold bends them."""
 
 import math
 
 import pytest
 import torch
+from steps import fills, make_step
+from worlds import NEVER_FALL, MakeEnv
 
-from telebip.mdp.commands import hold_heading
+from telebip.math import wrap_angle
+from telebip.mdp.binding import Binder
+from telebip.mdp.commands import VelocityCommands, hold_heading, turn_to
+from telebip.mdp.step import Step
+from telebip.robot import Robot
 
 
 def corrected(heading: float, reference: float, gain: float = 1.0, limit: float = 0.3) -> float:
@@ -45,3 +51,83 @@ def test_correction_adds_to_the_yaw_rate_alone() -> None:
     # 9 rad is 2.717 rad left of straight ahead, more than the limit.
     torch.testing.assert_close(result, torch.tensor([[0.7, 0.1, 0.3], [-0.5, -0.1, 0.1]]))
     torch.testing.assert_close(command, torch.tensor([[0.7, 0.1, 0.2], [-0.5, -0.1, -0.2]]))
+
+
+@pytest.mark.parametrize(
+    ("goal", "reference", "rate"),
+    [
+        (0.3, 0.0, 0.3),  # k = 1 /s
+        (0.0, 0.3, -0.3),
+        (2.0, 0.0, 0.8),  # as fast as is commanded at all
+        (3.0, -3.0, -(2 * math.pi - 6.0)),  # the short way round, right through pi
+        (-2.0, 0.0, -0.5),
+    ],
+)
+def test_a_heading_command_turns_the_short_way_within_the_range(goal: float, reference: float, rate: float) -> None:
+    turned = turn_to(torch.tensor([goal]), torch.tensor([reference]), stiffness=1.0, limits=(-0.5, 0.8))
+    assert turned.item() == pytest.approx(rate, abs=1e-5)
+
+
+RANGES = ((-0.6, 1.2), (-0.4, 0.4), (-0.8, 0.8))
+
+
+def drawn(step: Step, **shares: float) -> VelocityCommands:
+    """Commands of worlds that begin, given once."""
+    binder = Binder(step)
+    commands = VelocityCommands(binder, RANGES, 5.0, heading_stiffness=1.0, **shares)
+    binder.allocate().draw(torch.Generator().manual_seed(0))
+    commands.update(step)
+    return commands
+
+
+def test_without_shares_all_commands_fill_their_ranges(robot: Robot) -> None:
+    step = make_step(robot, 4096)
+    drawn(step)
+    for column, (low, high) in zip(step.env.target_command.T, RANGES, strict=True):
+        fills(column[:, None], low, high)
+    assert step.env.random.shape == (4096, 3)
+    assert not step.env.memory
+
+
+def test_each_share_gets_its_kind_of_command(robot: Robot) -> None:
+    step = make_step(robot, 8192)
+    step.env.reference_heading.fill_(0.5)
+    drawn(step, standing=0.1, forward=0.25, heading=0.4)
+    vx, vy, rate = step.env.target_command.T
+    standing, forward = (step.env.target_command == 0.0).all(1), (vy == 0.0) & (rate == 0.0) & (vx != 0.0)
+    turning = step.env.memory["commands"]["has_heading"]
+    assert not (turning & (standing | forward)).any()
+    for kind, share in ((standing, 0.1), (forward, 0.25 * 0.9), (turning, 0.4 * 0.75 * 0.9)):
+        assert kind.float().mean().item() == pytest.approx(share, abs=4.0 * math.sqrt(share * (1.0 - share) / 8192))
+    fills(vx[forward, None], 0.0, 1.2)
+    goal = step.env.memory["commands"]["heading"]
+    torch.testing.assert_close(rate[turning], wrap_angle(goal - 0.5)[turning].clamp(-0.8, 0.8))
+    free = ~(standing | forward | turning)
+    fills(vx[free, None], -0.6, 1.2)
+    fills(rate[free, None], -0.8, 0.8)
+
+
+def test_straight_ahead_stays_in_a_range_that_is_all_backward(robot: Robot) -> None:
+    step = make_step(robot, 64)
+    binder = Binder(step)
+    commands = VelocityCommands(binder, ((-0.5, -0.2), (0.0, 0.0), (0.0, 0.0)), 5.0, forward=1.0)
+    binder.allocate().draw(torch.Generator().manual_seed(0))
+    commands.update(step)
+    torch.testing.assert_close(step.env.target_command[:, 0], torch.full((64,), -0.2))
+
+
+def test_a_heading_command_is_reached_and_a_set_command_ends_it(make_env: MakeEnv) -> None:
+    headings = ("commands.rel_heading_envs=1", "commands.ang_vel_z=[-0.8,0.8]", "commands.heading_control_stiffness=2")
+    env = make_env(*headings, "commands.resampling_time=60", "episode.length=60", NEVER_FALL, calm=True)
+    goal = env.state.memory["commands"]["heading"].clone()
+    left = wrap_angle(goal - env.state.reference_heading)
+    for _ in range(50):
+        env.step(torch.zeros(4, 6))
+    assert (wrap_angle(goal - env.state.reference_heading).abs() < left.abs()).all()
+    assert (env.state.target_command[:, 2].abs() <= 0.8).all()
+    for _ in range(300):
+        env.step(torch.zeros(4, 6))
+    torch.testing.assert_close(wrap_angle(goal - env.state.reference_heading), torch.zeros(4), atol=0.01, rtol=0.0)
+    env.set_command(0.5, 0.0, 0.25)
+    env.step(torch.zeros(4, 6))
+    assert env.state.target_command.tolist() == [[0.5, 0.0, 0.25]] * 4
