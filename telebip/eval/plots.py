@@ -2,12 +2,13 @@
 
 import io
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.projections.polar import PolarAxes
 
 Results = dict[str, Any]
 
@@ -125,6 +126,46 @@ def _bars(
     axes.grid(axis="x", visible=False)
     if shown:
         axes.legend(**BESIDE)
+
+
+@rc_context(STYLE)
+def omni(results: Results) -> Figure:
+    """Errors over vx and vy and over vx and the yaw rate, the worst over the third, and the cost of transport by direction."""
+    rows = results["omni"]["grid"]
+    figure = Figure((9.6, 5.2), layout="constrained")
+    figure.suptitle(f"{named(results)}: what it follows (the worst over the third command; x: a world fell)", fontsize=10)
+    axes = figure.subplot_mosaic([["xy", "xw", "cost"], ["wy", "ww", "cost"]], per_subplot_kw={"cost": {"projection": "polar"}})
+    errors = {"x": ("lin_vel_error_mps", "velocity error [m/s]"), "w": ("yaw_rate_error_radps", "yaw rate error [rad/s]")}
+    for first, (name, title) in errors.items():
+        for second, column, label in (("y", 1, "vy [m/s]"), ("w", 2, "yaw rate [rad/s]")):
+            _map(axes[first + second], rows, column, name)
+            axes[first + second].set(xlabel="vx [m/s]", ylabel=label, title=title)
+    around = results["omni"]["directions"]
+    angle = [np.arctan2(row["command"][1], row["command"][0]) for row in around]
+    cost = [np.nan if row["cot_mechanical"] is None else row["cot_mechanical"] for row in around]
+    polar = cast(PolarAxes, axes["cost"])
+    polar.plot([*angle, angle[0]], [*cost, cost[0]], "o-", color=COLORS[0], lw=1.4, ms=4)
+    polar.set_theta_zero_location("N")  # forward is up, left is left
+    polar.set_title(f"cost of transport at {results['omni']['protocol']['direction_speed']:g} m/s", pad=14)
+    polar.set_ylim(0.0)
+    return figure
+
+
+def _map(axes: Axes, rows: Sequence[dict[str, Any]], column: int, error: str) -> None:
+    """Draw the largest error over vx (across) and the command in `column` (upwards), with its value in each cell."""
+    across, up = (sorted({row["command"][i] for row in rows}) for i in (0, column))
+    worst = np.zeros((len(up), len(across)))
+    for row in rows:
+        at = up.index(row["command"][column]), across.index(row["command"][0])
+        worst[at] = np.fmax(worst[at], np.nan_to_num(np.array(row[error], dtype=float)))
+        if row["falls"]:
+            axes.plot(at[1], at[0] - 0.3, "x", color="black", ms=4)
+    axes.imshow(worst, origin="lower", aspect="auto", cmap="YlOrRd", vmin=0.0, vmax=0.15)
+    for (i, k), value in np.ndenumerate(worst):
+        axes.text(k, i, f"{value:.2f}", ha="center", va="center", fontsize=7, color="white" if value > 0.1 else "black")
+    axes.set_xticks(range(len(across)), [f"{value:g}" for value in across])
+    axes.set_yticks(range(len(up)), [f"{value:g}" for value in up])
+    axes.grid(visible=False)
 
 
 @rc_context(STYLE)

@@ -110,6 +110,9 @@ def _comparisons(all_results: Sequence[Results], references: Sequence[Results]) 
             yield f"push_{horizon}", plots.push(together, horizon)
     if any(results.get("learning") for results in all_results):
         yield "learning", plots.learning(all_results)
+    omni = [results for results in all_results if results.get("omni")]
+    for i, results in enumerate(omni, 1):
+        yield f"omni_{i}" if len(omni) > 1 else "omni", plots.omni(results)
 
 
 def _figures_of_each(all_results: Sequence[Results]) -> Iterator[Figure]:
@@ -132,6 +135,8 @@ def _tables(all_results: Sequence[Results]) -> list[Table]:
     gait = ["walker", "command [m/s]", "period [s]", "regularity", "symmetry", "duty factor", "double support", "flight"]
     gait += ["peak force [body weights]", "stride [m]", "knee stroke [m]"]
     learning = ["walker", "samples", "to 95 % of the final episode length", "to 95 % of the final return"]
+    omni = ["walker", "largest error [m/s]", "[rad/s]", "falls", "falls after changes", "COT straight ahead"]
+    omni += ["forward [m/s]", "backward [m/s]", "sideways [m/s]", "turning [rad/s]"]
     horizons = sorted({h for _, limits in of("push") for h in limits if h != "protocol"}, key=lambda h: float(h[:-1]))
     return [
         ("Tracking and cost of transport", tracking, [[k, *_tracking_cells(r)] for k, rows in of("tracking") for r in rows]),
@@ -143,6 +148,7 @@ def _tables(all_results: Sequence[Results]) -> list[Table]:
             )
             for horizon in horizons
         ),
+        ("All directions", omni, [[label, *_omni_cells(part)] for label, part in of("omni")]),
         ("Gait", gait, [[label, *(number(value, 3) for value in row.values())] for label, row in of("gait")]),
         ("Learning", learning, [[label, *_learning_cells(curve)] for label, curve in of("learning")]),
     ]
@@ -167,6 +173,21 @@ def _push_cells(limits: dict[str, float]) -> list[str]:
         *(number(limits[f"{name}_n"], 0) for name in names),
         " / ".join(number(limits.get(f"{name}_ns"), 1) for name in names),
         " / ".join(number(limits.get(f"{name}_bw"), 2) for name in names),
+    ]
+
+
+def _omni_cells(part: dict[str, Any]) -> list[str]:
+    worst, limits = part["worst"], part["limits"]
+    return [
+        number(worst["lin_vel_error_mps"], 3),
+        number(worst["yaw_rate_error_radps"], 3),
+        f"{worst['falls']} of {sum(row['worlds'] for row in part['grid'])}",
+        f"{worst['change_falls']} of {sum(row['worlds'] for row in part['changes'])}",
+        " / ".join(number(row["cot_mechanical"], 3) for row in part["straight"]),
+        number(limits["forward_mps"], 1),
+        number(limits["backward_mps"], 1),
+        number(min(limits["left_mps"], limits["right_mps"]), 1),
+        number(min(limits["turn_left_radps"], limits["turn_right_radps"]), 1),
     ]
 
 

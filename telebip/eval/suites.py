@@ -22,13 +22,14 @@ from telebip.eval import terrain
 from telebip.eval.conditions import SPEEDS, as_evaluated, forward_commands, on_flat_ground, trained_speeds
 from telebip.eval.gait import summarise_gait
 from telebip.eval.learning import learning_curve
+from telebip.eval.omni import OmniProtocol, omni_results
 from telebip.eval.push import PushProtocol, push_limits, push_trial
 from telebip.eval.walk import heading_velocity, summarise
 from telebip.robot import Robot
 from telebip.rollout import Rollout, roll_out
 from telebip.sim import Backend, choose_backend
 
-SUITES = ("tracking", "push", "gait", "terrain", "learning")
+SUITES = ("tracking", "push", "gait", "learning", "omni", "terrain")
 Progress = Callable[[str, int, int], None]  # called with what is running, the finished steps and their total
 
 
@@ -60,6 +61,7 @@ class Protocol:
     skip: float = 5.0  # s, left out of all means
     commands: tuple[float, ...] | None = None  # m/s; None: those of `SPEEDS` that the policy was trained on
     push: PushProtocol = field(default_factory=PushProtocol)
+    omni: OmniProtocol = field(default_factory=OmniProtocol)
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
     backend: Backend = "auto"
 
@@ -101,6 +103,8 @@ def evaluate(
         results["push"] = _push(candidate, robot, protocol, progress)
     if "terrain" in suites:
         results["terrain"] = _cross(candidate, robot, protocol, progress)
+    if "omni" in suites:
+        results["omni"] = _omni(candidate, robot, protocol, progress)
     if "learning" in suites:
         results["learning"] = curve
     return results
@@ -127,14 +131,20 @@ def _push_protocol(candidate: Candidate, protocol: Protocol) -> PushProtocol:
 def is_current(results: dict[str, Any], candidate: Candidate, suites: Sequence[str], protocol: Protocol) -> bool:
     """Whether results from a file are what `evaluate` would measure again: all of the suites, of the same, in the same way."""
     push = _push_protocol(candidate, protocol)
-    pushed = asdict(push) | {"horizons": list(push.horizons)}
+    pushed, omni = _as_json(push), _as_json(protocol.omni)
     return (
         set(suites) <= results.keys()
         and all(results[suite] for suite in suites if suite != "learning")  # which may be null
         and results.get("fingerprint") == candidate.fingerprint
         and results.get("protocol") == _walking_protocol(candidate, protocol)
         and ("push" not in suites or results["push"].get("protocol") == pushed)
+        and ("omni" not in suites or results["omni"].get("protocol") == omni)
     )
+
+
+def _as_json(protocol: PushProtocol | OmniProtocol) -> dict[str, Any]:
+    """Return a protocol as it comes back from a file of results: tuples are lists there."""
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(protocol).items()}
 
 
 def commands_of(candidate: Candidate, protocol: Protocol) -> tuple[float, ...]:
@@ -206,6 +216,14 @@ def _cross(candidate: Candidate, robot: Robot, protocol: Protocol, progress: Pro
     crossing = terrain.cross(env, policy, speed, lambda step, steps: progress(name, step, steps))
     rows = terrain.levels_of(config, env, crossing)
     return {"command_mps": speed, "limits": terrain.limits(rows), "levels": rows}
+
+
+def _omni(candidate: Candidate, robot: Robot, protocol: Protocol, progress: Progress) -> dict[str, Any]:
+    omni = protocol.omni
+    env = make_env(candidate, robot, protocol, omni.num_envs, omni.duration)
+    name, total = f"walking {env.num_envs} worlds in all directions", round(omni.duration / env.step_dt)
+    results = omni_results(env, candidate.make_policy(env), omni, lambda step: progress(name, step, total))
+    return {"protocol": _as_json(omni), **results}
 
 
 def _speed_series(walks: dict[float, Rollout]) -> dict[str, Any]:

@@ -16,14 +16,18 @@ from telebip.control.policy import Stateless
 from telebip.errors import UserError
 from telebip.eval import plots
 from telebip.eval.learning import learning_curve, samples_to
+from telebip.eval.omni import OmniProtocol
 from telebip.eval.push import PushProtocol
 from telebip.eval.report import can_be_shown, read_results, write_report, write_results
 from telebip.eval.suites import SUITES, Candidate, Protocol, check_suites, commands_of, evaluate, is_current, make_env
 from telebip.robot import Robot, load_robot
 
 POLICY = "assets/policies/telebip_flat"
+OMNI = OmniProtocol(
+    lin_vel_x=(0.5, 0.7), lin_vel_y=(0.0,), ang_vel_z=(-0.1, 0.0), changes=2, worlds=2, duration=6.0, change_at=2.0, skip=2.0
+)
 PROTOCOL = Protocol(
-    worlds=4, duration=8.0, skip=3.0, push=PushProtocol(max_force=10.0, worlds=1, warmup=1.0, horizons=(1.0, 2.0))
+    worlds=4, duration=8.0, skip=3.0, push=PushProtocol(max_force=10.0, worlds=1, warmup=1.0, horizons=(1.0, 2.0)), omni=OMNI
 )
 
 
@@ -62,6 +66,24 @@ def test_gait_and_pushes(results: dict[str, Any]) -> None:
     }
 
 
+def test_all_directions(results: dict[str, Any]) -> None:
+    omni = results["omni"]
+    assert [row["command"] for row in omni["grid"]] == [[0.5, 0.0, -0.1], [0.5, 0.0, 0.0], [0.7, 0.0, -0.1], [0.7, 0.0, 0.0]]
+    for row in omni["grid"]:
+        assert row["mean"] == pytest.approx(row["command"], abs=0.06)
+        assert row["lin_vel_error_mps"] <= omni["worst"]["lin_vel_error_mps"] < 0.06
+        assert row["yaw_rate_error_radps"] <= omni["worst"]["yaw_rate_error_radps"] < 0.05
+        assert (row["falls"], row["worlds"]) == (0, 2)
+    tracked = {row["command_mps"]: row["cot_mechanical"] for row in results["tracking"]}
+    for row in omni["straight"]:
+        assert row["cot_mechanical"] == pytest.approx(tracked[row["command"][0]], rel=0.15)
+    for row in omni["changes"]:  # the means are those of the second command
+        assert row["before"] != row["command"]
+        assert row["mean"] == pytest.approx(row["command"], abs=0.1)
+    assert omni["worst"]["falls"] == omni["worst"]["change_falls"] == 0
+    assert omni["limits"]["left_mps"] < 0.5  # it has not learned to walk sideways
+
+
 def test_the_same_seed_gives_the_same_results(candidate: Candidate, robot: Robot) -> None:
     protocol = dataclasses.replace(PROTOCOL, duration=3.0, skip=1.0)
     a, b = (evaluate(candidate, robot, ("tracking", "gait"), protocol) for _ in range(2))
@@ -98,6 +120,7 @@ def test_results_are_current_for_the_same_candidate_measured_in_the_same_way(
     assert is_current(back, candidate, SUITES, PROTOCOL)
     assert not is_current(back, candidate, SUITES, dataclasses.replace(PROTOCOL, worlds=5))
     assert not is_current(back, candidate, SUITES, dataclasses.replace(PROTOCOL, push=PushProtocol()))
+    assert not is_current(back, candidate, SUITES, dataclasses.replace(PROTOCOL, omni=OmniProtocol()))
     assert not is_current(back, dataclasses.replace(candidate, fingerprint="of another"), SUITES, PROTOCOL)
     assert not is_current({key: value for key, value in back.items() if key != "gait"}, candidate, SUITES, PROTOCOL)
 
@@ -142,7 +165,7 @@ def test_the_report_shows_the_numbers_beside_the_articles_in_one_file(results: d
         assert speed in text
         assert "0.693" in text  # the article's mean speed at 0.7 m/s
         assert "angular momentum" in text
-    assert page.count("<svg") == 4  # cost of transport, speed, feet, joints: there is no push of ten seconds here
+    assert page.count("<svg") == 5  # cost of transport, omni, speed, feet, joints: there is no push of ten seconds here
     assert "How &lt;it&gt; walks" in page
     assert not re.search(r"(src|href)=\"http", page)  # complete in itself
     assert re.findall(r"!\[.*\]\((.*)\)", markdown) == ["cost_of_transport.svg"]
