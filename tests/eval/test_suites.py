@@ -168,7 +168,7 @@ def test_the_report_shows_the_numbers_beside_the_articles_in_one_file(results: d
     assert page.count("<svg") == 5  # cost of transport, omni, speed, feet, joints: there is no push of ten seconds here
     assert "How &lt;it&gt; walks" in page
     assert not re.search(r"(src|href)=\"http", page)  # complete in itself
-    assert re.findall(r"!\[.*\]\((.*)\)", markdown) == ["cost_of_transport.svg"]
+    assert re.findall(r"!\[.*\]\((.*)\)", markdown) == ["cost_of_transport.svg", "omni.svg"]
     assert (tmp_path / "cost_of_transport.svg").read_text().startswith("<svg")
 
 
