@@ -18,6 +18,7 @@ EXAMPLES = """\
   evaluate.py --checkpoint runs/telebip_flat/2026-01-31_12-00-00 --suite tracking,gait
   evaluate.py --checkpoint assets/policies/telebip_flat --suite push --max-force 150
   evaluate.py --checkpoint assets/policies/telebip_omni --suite omni
+  evaluate.py --checkpoint assets/policies/telebip_rough --suite tracking,terrain
   evaluate.py --controller dcm control.step_time=0.2 sim.decimation=1
   evaluate.py --controller alip --suite tracking --commands=-0.3,0.5        (with = before a negative number)
 """
@@ -37,6 +38,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         from telebip.eval.push import PushProtocol
         from telebip.eval.report import write_report
         from telebip.eval.suites import Protocol, check_suites
+        from telebip.eval.terrain import TerrainProtocol
     suites = check_suites(options.suite.split(","))
     check_overrides(options.overrides, suites)
     protocol = Protocol(
@@ -46,6 +48,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         commands=options.commands,
         push=PushProtocol(max_force=options.max_force, worlds=options.push_worlds),
         omni=OmniProtocol(worlds=options.omni_worlds),
+        terrain=TerrainProtocol(worlds=options.terrain_worlds),
         device=resolve_device(options.device),
         backend=options.backend,
     )
@@ -167,14 +170,14 @@ def speeds(text: str) -> tuple[float, ...]:
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = Parser(
-        "Measure how something walks (tracking, energy, pushes, gait, learning, omni), beside the article's numbers.",
+        "Measure how something walks: tracking, energy, pushes, gait, learning, all directions, rough terrain.",
         EXAMPLES,
     )
     who = parser.add_mutually_exclusive_group()
     who.add_argument("--checkpoint", metavar="PATH_OR_RUN", help="a checkpoint file, or a run folder for its newest")
     who.add_argument("--controller", choices=CONTROLLERS, help="a model-based walker: angular momentum, or DCM")
     suites = "tracking,push,gait,learning"
-    parser.add_argument("--suite", default=suites, metavar="A,B", help=f"which suites; there is also omni (default: {suites})")
+    parser.add_argument("--suite", default=suites, metavar="A,B", help=f"which suites; also omni, terrain (default: {suites})")
     parser.add_argument("--out", metavar="DIR", help="folder of results.json and the report (default: reports/<label>)")
     parser.add_argument("--label", metavar="NAME", help="name in tables and plots (default: the task's)")
     parser.add_argument("--num-envs", type=int, default=64, metavar="N", help="worlds for each commanded speed (default: 64)")
@@ -189,6 +192,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--max-force", type=float, default=300.0, metavar="N", help="largest push tried in N (default: 300)")
     parser.add_argument("--push-worlds", type=int, default=32, metavar="N", help="worlds for each push (default: 32)")
     parser.add_argument("--omni-worlds", type=int, default=16, metavar="N", help="worlds for each omni command (default: 16)")
+    parser.add_argument("--terrain-worlds", type=int, default=64, metavar="N", help="worlds for each level (default: 64)")
     parser.add_engine()
     parser.add_overrides()
     options = parser.parse(argv)
@@ -197,14 +201,17 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
             "what is to be measured? --checkpoint PATH_OR_RUN (try assets/policies/telebip_efficient), or --controller"
         )
     bounds = {"num_envs": (1, 2**20), "duration": (1, 3600), "max_force": (5, 5000), "push_worlds": (1, 2**16)}
-    bounds["omni_worlds"] = (1, 2**12)
+    bounds |= {"omni_worlds": (1, 2**12), "terrain_worlds": (1, 2**12)}
     for name, (low, high) in bounds.items():
         value = getattr(options, name)
         if not low <= value <= high:
             raise UserError(f"--{name.replace('_', '-')} must be between {low:g} and {high:g}, got {value:g}")
     options.given = [
         f"--{name.replace('_', '-')}={','.join(map(str, value)) if isinstance(value, tuple) else value}"
-        for name in ("suite", "num_envs", "duration", "commands", "max_force", "push_worlds", "omni_worlds", "backend")
+        for name in (
+            *("suite", "num_envs", "duration", "commands", "max_force"),
+            *("push_worlds", "omni_worlds", "terrain_worlds", "backend"),
+        )
         if (value := getattr(options, name)) != parser.get_default(name)
     ]
     return options

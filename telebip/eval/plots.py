@@ -169,6 +169,37 @@ def _map(axes: Axes, rows: Sequence[dict[str, Any]], column: int, error: str) ->
 
 
 @rc_context(STYLE)
+def terrain(results: Results) -> Figure:
+    """Share of the robots that leave their tile on foot, by type and level of the terrain."""
+    rows = results["terrain"]["levels"]
+    kinds = list(dict.fromkeys(row["type"] for row in rows))
+    figure = Figure((9.6, 0.8 + 0.42 * len(kinds)), layout="constrained")
+    axes = figure.subplots()
+    for i, kind in enumerate(kinds):
+        of_kind = [row for row in rows if row["type"] == kind]
+        axes.imshow(
+            np.array([[row["success"] for row in of_kind]]),
+            extent=(-0.5, len(of_kind) - 0.5, i + 0.46, i - 0.46),
+            aspect="auto",
+            cmap="RdYlGn",
+            vmin=0.0,
+            vmax=1.0,
+        )
+        for k, row in enumerate(of_kind):
+            axes.text(k, i, f"{100.0 * row['success']:.0f} %\n{obstacle(row)}", ha="center", va="center", fontsize=6.5)
+    axes.set_yticks(range(len(kinds)), [kind.replace("_", " ") for kind in kinds])
+    axes.set(xlim=(-0.5, len(rows) / len(kinds) - 0.5), ylim=(len(kinds) - 0.5, -0.5), xticks=[])
+    axes.grid(visible=False)
+    axes.set_title(f"{named(results)}: who leaves the tile on foot, at {results['terrain']['protocol']['command']:g} m/s")
+    return figure
+
+
+def obstacle(row: Mapping[str, Any]) -> str:
+    """Return the size of a level's obstacles as people say it: "12 cm", "7.5°"."""
+    return f"{np.degrees(row['size']):g}°" if row["unit"] == "rad" else f"{100.0 * row['size']:g} cm"
+
+
+@rc_context(STYLE)
 def joints(results: Results) -> Figure:
     """Where the energy goes: each actuator's share of the cost of transport."""
     rows = results["tracking"]

@@ -110,9 +110,10 @@ def _comparisons(all_results: Sequence[Results], references: Sequence[Results]) 
             yield f"push_{horizon}", plots.push(together, horizon)
     if any(results.get("learning") for results in all_results):
         yield "learning", plots.learning(all_results)
-    omni = [results for results in all_results if results.get("omni")]
-    for i, results in enumerate(omni, 1):
-        yield f"omni_{i}" if len(omni) > 1 else "omni", plots.omni(results)
+    for suite, draw in (("omni", plots.omni), ("terrain", plots.terrain)):
+        measured = [results for results in all_results if results.get(suite)]
+        for i, results in enumerate(measured, 1):
+            yield f"{suite}_{i}" if len(measured) > 1 else suite, draw(results)
 
 
 def _figures_of_each(all_results: Sequence[Results]) -> Iterator[Figure]:
@@ -137,6 +138,8 @@ def _tables(all_results: Sequence[Results]) -> list[Table]:
     learning = ["walker", "samples", "to 95 % of the final episode length", "to 95 % of the final return"]
     omni = ["walker", "largest error [m/s]", "[rad/s]", "falls", "falls after changes", "COT straight ahead"]
     omni += ["forward [m/s]", "backward [m/s]", "sideways [m/s]", "turning [rad/s]"]
+    rough = of("terrain")
+    kinds = [name.replace("_", " ") for name in rough[0][1]["limits"]] if rough else []
     horizons = sorted({h for _, limits in of("push") for h in limits if h != "protocol"}, key=lambda h: float(h[:-1]))
     return [
         ("Tracking and cost of transport", tracking, [[k, *_tracking_cells(r)] for k, rows in of("tracking") for r in rows]),
@@ -149,6 +152,11 @@ def _tables(all_results: Sequence[Results]) -> list[Table]:
             for horizon in horizons
         ),
         ("All directions", omni, [[label, *_omni_cells(part)] for label, part in of("omni")]),
+        (
+            "Hardest terrain passed",
+            ["walker", *kinds],
+            [[label, *_terrain_cells(part)] for label, part in rough],
+        ),
         ("Gait", gait, [[label, *(number(value, 3) for value in row.values())] for label, row in of("gait")]),
         ("Learning", learning, [[label, *_learning_cells(curve)] for label, curve in of("learning")]),
     ]
@@ -189,6 +197,11 @@ def _omni_cells(part: dict[str, Any]) -> list[str]:
         number(min(limits["left_mps"], limits["right_mps"]), 1),
         number(min(limits["turn_left_radps"], limits["turn_right_radps"]), 1),
     ]
+
+
+def _terrain_cells(part: dict[str, Any]) -> list[str]:
+    units = {row["type"]: row["unit"] for row in part["levels"]}
+    return [plots.obstacle({"size": size, "unit": units[name]}) if size else "-" for name, size in part["limits"].items()]
 
 
 def _learning_cells(curve: dict[str, Any]) -> list[str]:

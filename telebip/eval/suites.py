@@ -1,6 +1,7 @@
 """The evaluator: runs suites on anything that walks, and returns results ready for JSON (fields: `docs/evaluation.md`)."""
 
 import dataclasses
+import math
 import platform
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
@@ -18,12 +19,12 @@ from telebip.control.factory import with_estimate
 from telebip.control.policy import Policy
 from telebip.env import TelebipEnv
 from telebip.errors import UserError, nearest
-from telebip.eval import terrain
 from telebip.eval.conditions import SPEEDS, as_evaluated, forward_commands, on_flat_ground, trained_speeds
 from telebip.eval.gait import summarise_gait
 from telebip.eval.learning import learning_curve
 from telebip.eval.omni import OmniProtocol, omni_results
 from telebip.eval.push import PushProtocol, push_limits, push_trial
+from telebip.eval.terrain import TerrainProtocol, on_test_ground, terrain_results
 from telebip.eval.walk import heading_velocity, summarise
 from telebip.robot import Robot
 from telebip.rollout import Rollout, roll_out
@@ -62,6 +63,7 @@ class Protocol:
     commands: tuple[float, ...] | None = None  # m/s; None: those of `SPEEDS` that the policy was trained on
     push: PushProtocol = field(default_factory=PushProtocol)
     omni: OmniProtocol = field(default_factory=OmniProtocol)
+    terrain: TerrainProtocol = field(default_factory=TerrainProtocol)
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
     backend: Backend = "auto"
 
@@ -102,7 +104,7 @@ def evaluate(
     if "push" in suites:
         results["push"] = _push(candidate, robot, protocol, progress)
     if "terrain" in suites:
-        results["terrain"] = _cross(candidate, robot, protocol, progress)
+        results["terrain"] = _terrain(candidate, robot, protocol, progress)
     if "omni" in suites:
         results["omni"] = _omni(candidate, robot, protocol, progress)
     if "learning" in suites:
@@ -128,10 +130,17 @@ def _push_protocol(candidate: Candidate, protocol: Protocol) -> PushProtocol:
     return dataclasses.replace(protocol.push, command=command)
 
 
+def _terrain_protocol(candidate: Candidate, protocol: Protocol) -> TerrainProtocol:
+    """Return how the terrain suite is run: at a speed that the policy was trained on."""
+    low, high = candidate.task.commands.lin_vel_x
+    command = protocol.terrain.command if candidate.is_model_based else float(np.clip(protocol.terrain.command, low, high))
+    return dataclasses.replace(protocol.terrain, command=command)
+
+
 def is_current(results: dict[str, Any], candidate: Candidate, suites: Sequence[str], protocol: Protocol) -> bool:
     """Whether results from a file are what `evaluate` would measure again: all of the suites, of the same, in the same way."""
     push = _push_protocol(candidate, protocol)
-    pushed, omni = _as_json(push), _as_json(protocol.omni)
+    pushed, omni, terrain = _as_json(push), _as_json(protocol.omni), _as_json(_terrain_protocol(candidate, protocol))
     return (
         set(suites) <= results.keys()
         and all(results[suite] for suite in suites if suite != "learning")  # which may be null
@@ -139,10 +148,11 @@ def is_current(results: dict[str, Any], candidate: Candidate, suites: Sequence[s
         and results.get("protocol") == _walking_protocol(candidate, protocol)
         and ("push" not in suites or results["push"].get("protocol") == pushed)
         and ("omni" not in suites or results["omni"].get("protocol") == omni)
+        and ("terrain" not in suites or results["terrain"].get("protocol") == terrain)
     )
 
 
-def _as_json(protocol: PushProtocol | OmniProtocol) -> dict[str, Any]:
+def _as_json(protocol: PushProtocol | OmniProtocol | TerrainProtocol) -> dict[str, Any]:
     """Return a protocol as it comes back from a file of results: tuples are lists there."""
     return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(protocol).items()}
 
@@ -205,17 +215,14 @@ def _push(candidate: Candidate, robot: Robot, protocol: Protocol, progress: Prog
     return {"protocol": asdict(push), **push_limits(survival, push, robot.weight)}
 
 
-def _cross(candidate: Candidate, robot: Robot, protocol: Protocol, progress: Progress) -> dict[str, Any]:
-    """Walk over every type and level of the terrain suite as one batch."""
-    speed = protocol.commands[0] if protocol.commands else trained_speeds(candidate.task)[0]
-    num_envs = protocol.worlds * terrain.LEVELS * len(terrain.TYPES)
-    config = terrain.on_test_ground(as_evaluated(candidate.config, num_envs, terrain.seconds(speed), candidate.overrides))
+def _terrain(candidate: Candidate, robot: Robot, protocol: Protocol, progress: Progress) -> dict[str, Any]:
+    terrain = _terrain_protocol(candidate, protocol)
+    config = as_evaluated(candidate.config, terrain.num_envs, terrain.seconds, candidate.overrides)
     config = with_estimate(config) if candidate.is_model_based else config
-    env = TelebipEnv(config, robot, protocol.device, protocol.backend)
-    policy, name = candidate.make_policy(env), f"crossing terrain in {num_envs} worlds"
-    crossing = terrain.cross(env, policy, speed, lambda step, steps: progress(name, step, steps))
-    rows = terrain.levels_of(config, env, crossing)
-    return {"command_mps": speed, "limits": terrain.limits(rows), "levels": rows}
+    env = TelebipEnv(on_test_ground(config), robot, protocol.device, protocol.backend)
+    name, total = f"crossing terrain in {env.num_envs} worlds", math.ceil(terrain.seconds / env.step_dt)
+    results = terrain_results(env, candidate.make_policy(env), terrain, lambda step: progress(name, step, total))
+    return {"protocol": _as_json(terrain), **results}
 
 
 def _omni(candidate: Candidate, robot: Robot, protocol: Protocol, progress: Progress) -> dict[str, Any]:

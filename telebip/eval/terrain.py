@@ -1,13 +1,13 @@
 """How rough a ground a policy walks on: the share of robots that leave their tile on foot, by type and level of the terrain."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from numpy.typing import NDArray
 
 from telebip.config import TaskConfig, check
 from telebip.control.policy import Policy
@@ -28,18 +28,27 @@ TYPES: dict[str, dict[str, Any]] = {
 }
 """The grounds of the suite, the same for every policy."""
 LEVELS, SIZE = 12, 6.0  # rows of tiles, and the side of a tile [m]
-SKIP = 1.0  # s, left out of speed and cost
-SLACK = 1.25  # how many times the commanded time a robot may take
-PASSED = 0.95  # share of the robots that makes a level one that the policy walks on
 
 
 @dataclass(frozen=True)
-class Crossing:
-    """What became of every world, (num_envs,) each, after `SKIP` seconds where it is a mean."""
+class TerrainProtocol:
+    """Robots that walk straight ahead from the middle of a tile of every type and level, each in a random direction."""
 
-    arrived: Tensor  # bool: it left its tile on foot, in time
-    speed: Tensor  # mean, along the heading [m/s]
-    cost_of_transport: Tensor  # mean power over weight and speed [-]
+    worlds: int = 64  # for each type and level
+    command: float = 0.5  # m/s, forward
+    slack: float = 1.25  # how many times the commanded time a robot may take to the edge of its tile
+    skip: float = 1.0  # s, left out of speed and cost
+    passed: float = 0.95  # share of the robots that makes a level one that the policy walks on
+
+    @property
+    def num_envs(self) -> int:
+        """Worlds in all: every tile at once."""
+        return self.worlds * LEVELS * len(TYPES)
+
+    @property
+    def seconds(self) -> float:
+        """How long the slowest robot that counts may take: to a corner of its tile [s]."""
+        return self.slack * math.sqrt(0.5) * SIZE / self.command
 
 
 def on_test_ground(config: TaskConfig) -> TaskConfig:
@@ -48,72 +57,80 @@ def on_test_ground(config: TaskConfig) -> TaskConfig:
     events = {name: params for name, params in config.events.items() if params.get("term", name) != "terrain_level"}
     if "start_pose" in events:
         events["start_pose"] = {**events["start_pose"], "heading": math.pi}
-    room = replace(
-        config.sim, max_contacts=max(16, config.sim.max_contacts), max_constraints=max(96, config.sim.max_constraints)
-    )
-    return check(replace(config, terrain=terrain, events=events, sim=room))
+    contacts, constraints = max(16, config.sim.max_contacts), max(96, config.sim.max_constraints)
+    sim = replace(config.sim, max_contacts=contacts, max_constraints=constraints)
+    return check(replace(config, terrain=terrain, events=events, sim=sim))
 
 
-def seconds(speed: float) -> float:
-    """Return how long the slowest robot that counts as arrived may take: to a corner of its tile [s]."""
-    return SLACK * math.sqrt(0.5) * SIZE / speed
+def terrain_results(
+    env: TelebipEnv, policy: Policy, protocol: TerrainProtocol, progress: Callable[[int], None] = lambda step: None
+) -> dict[str, Any]:
+    """Walk every type and level of the terrain as one batch.
 
+    A robot arrives if it leaves its tile without a fall in `slack` times the time that its way takes at the commanded speed.
 
-def cross(env: TelebipEnv, policy: Policy, speed: float, progress: Callable[[int, int], None] = lambda *args: None) -> Crossing:
-    """Walk `policy` straight ahead at `speed` [m/s] from the middle of each world's tile until every world's time is over.
+    Args:
+        env: `protocol.num_envs` undisturbed worlds `on_test_ground`.
+        policy: what walks.
+        protocol: how.
+        progress: called with the number of finished policy steps.
 
-    A robot has arrived if it has left its tile without a fall in `SLACK` times the time that its way takes at this speed.
+    Returns:
+        `levels`: of each type and level the size of its obstacles, the share that arrived with its 95 % interval, and the
+        median speed and cost of transport of those; `limits`: of each type the size of the hardest level up to which at least
+        `passed` arrive. docs/evaluation.md describes the fields.
 
     Raises:
-        UserError: the engine had no room for a world's contacts.
+        UserError: the engine had no room for a world's contacts or constraints.
     """
-    env.set_command(speed, 0.0, 0.0)
+    env.set_command(protocol.command, 0.0, 0.0)
     heading = env.view().heading
     way = 0.5 * SIZE / torch.maximum(torch.cos(heading).abs(), torch.sin(heading).abs())
-    steps = math.ceil(seconds(speed) / env.step_dt)
-    walking, arrived = torch.ones_like(heading, dtype=torch.bool), torch.zeros_like(heading, dtype=torch.bool)
+    walks, arrived = torch.ones_like(heading, dtype=torch.bool), torch.zeros_like(heading, dtype=torch.bool)
     distance, energy, time = (torch.zeros_like(heading) for _ in range(3))
+    steps = math.ceil(protocol.seconds / env.step_dt)
     for step, stride in zip(range(1, steps + 1), walk(env, policy), strict=False):
         state, psi, now = env.sim.state, env.view().heading, step * env.step_dt
-        arrived |= walking & stride.extras["time_outs"]
-        walking &= ~stride.dones & (now <= SLACK * way / speed)
-        if now > SKIP:
+        arrived |= walks & stride.extras["time_outs"]
+        walks &= ~stride.dones & (now <= protocol.slack * way / protocol.command)
+        if now > protocol.skip:
             ahead = torch.cos(psi) * state.base_lin_vel_w[:, 0] + torch.sin(psi) * state.base_lin_vel_w[:, 1]
-            for total, rate in ((distance, ahead), (energy, state.joint_power.sum(1)), (time, torch.ones_like(ahead))):
-                total += env.step_dt * rate * walking
-        progress(step, steps)
+            distance += env.step_dt * ahead * walks
+            energy += env.step_dt * state.joint_power.sum(1) * walks
+            time += env.step_dt * walks
+        progress(step)
     judge_faults(env)
-    return Crossing(arrived, distance / time, energy / (env.robot.weight * distance))
+    measured = {"speed_mps": distance / time, "cot": energy / (env.robot.weight * distance)}
+    measured = {name: values.cpu().numpy() for name, values in measured.items()}
+    tile, there, levels = env.state.tile.cpu().numpy(), arrived.cpu().numpy(), {}
+    for kind, (name, params) in enumerate(TYPES.items()):
+        unit, ends = ("rad", ANGLE) if "angle" in params else ("m", HEIGHT)
+        worlds = [(tile == [kind, level]).all(1) for level in range(LEVELS)]
+        rows = [_row(there[here], {key: values[here] for key, values in measured.items()}) for here in worlds]
+        sizes = np.linspace(*ends, LEVELS).round(5).tolist()
+        levels[name] = [{"type": name, "size": size, "unit": unit, **row} for size, row in zip(sizes, rows, strict=True)]
+    return {
+        "limits": {name: limit(rows, protocol.passed) for name, rows in levels.items()},
+        "levels": [row for rows in levels.values() for row in rows],
+    }
 
 
-def levels_of(config: TaskConfig, env: TelebipEnv, crossing: Crossing) -> list[dict[str, Any]]:
-    """Return a row for each type and level, from the easiest on: what it is, the share that arrived, its speed and its cost."""
-    tile, rows = env.state.tile.cpu(), []
-    for column, (name, params) in enumerate(config.terrain.types.items()):
-        unit, (low, high) = ("rad", params["angle"]) if "angle" in params else ("m", params.get("rise") or params["height"])
-        for level in range(LEVELS):
-            here = (tile == torch.tensor([column, level])).all(1)
-            arrived = crossing.arrived.cpu()[here].numpy()
-            share, (least, most) = arrived.mean(), wilson(int(arrived.sum()), len(arrived))
-            row = {"type": name, "size": low + level / (LEVELS - 1) * (high - low), "unit": unit, "worlds": len(arrived)}
-            row |= {"success": float(share), "success_low": least, "success_high": most}
-            for key, values in (("speed_mps", crossing.speed), ("cot_mechanical", crossing.cost_of_transport)):
-                kept = values.cpu()[here].numpy()[arrived]
-                row[key] = float(np.median(kept)) if len(kept) else math.nan
-            rows.append({key: round(value, 5) if isinstance(value, float) else value for key, value in row.items()})
-    return rows
+def _row(arrived: NDArray[np.bool_], measured: Mapping[str, NDArray[np.floating]]) -> dict[str, Any]:
+    """Return the share of a tile's robots (n,) that arrived, and the medians of what was measured of these."""
+    number, least_most = int(arrived.sum()), wilson(int(arrived.sum()), len(arrived))
+    medians = {key: float(np.median(values[arrived])) if number else math.nan for key, values in measured.items()}
+    row = {"success": number / len(arrived), "success_low": least_most[0], "success_high": least_most[1], **medians}
+    return {"worlds": len(arrived), **{key: round(value, 5) for key, value in row.items()}}
 
 
-def limits(rows: list[dict[str, Any]]) -> dict[str, float]:
-    """Return for each type the size of the hardest level up to which at least `PASSED` of the robots arrive; 0 if on none."""
-    found: dict[str, float] = {}
-    for name in dict.fromkeys(row["type"] for row in rows):
-        found[name] = 0.0
-        for row in (row for row in rows if row["type"] == name):
-            if row["success"] < PASSED:
-                break
-            found[name] = row["size"]
-    return found
+def limit(rows: Sequence[dict[str, Any]], passed: float) -> float:
+    """Return the size of the hardest level up to which at least the share `passed` arrives; 0 if on none."""
+    size = 0.0
+    for row in rows:
+        if row["success"] < passed:
+            break
+        size = row["size"]
+    return size
 
 
 def wilson(successes: int, number: int) -> tuple[float, float]:

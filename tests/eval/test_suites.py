@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from telebip.eval.omni import OmniProtocol
 from telebip.eval.push import PushProtocol
 from telebip.eval.report import can_be_shown, read_results, write_report, write_results
 from telebip.eval.suites import SUITES, Candidate, Protocol, check_suites, commands_of, evaluate, is_current, make_env
+from telebip.eval.terrain import LEVELS, TYPES, TerrainProtocol
 from telebip.robot import Robot, load_robot
 
 POLICY = "assets/policies/telebip_flat"
@@ -27,7 +29,12 @@ OMNI = OmniProtocol(
     lin_vel_x=(0.5, 0.7), lin_vel_y=(0.0,), ang_vel_z=(-0.1, 0.0), changes=2, worlds=2, duration=6.0, change_at=2.0, skip=2.0
 )
 PROTOCOL = Protocol(
-    worlds=4, duration=8.0, skip=3.0, push=PushProtocol(max_force=10.0, worlds=1, warmup=1.0, horizons=(1.0, 2.0)), omni=OMNI
+    worlds=4,
+    duration=8.0,
+    skip=3.0,
+    push=PushProtocol(max_force=10.0, worlds=1, warmup=1.0, horizons=(1.0, 2.0)),
+    omni=OMNI,
+    terrain=TerrainProtocol(worlds=1),
 )
 
 
@@ -84,6 +91,20 @@ def test_all_directions(results: dict[str, Any]) -> None:
     assert omni["limits"]["left_mps"] < 0.5  # it has not learned to walk sideways
 
 
+def test_terrain(results: dict[str, Any]) -> None:
+    terrain = results["terrain"]
+    assert [row["type"] for row in terrain["levels"]] == [name for name in TYPES for _ in range(LEVELS)]
+    easiest, hardest = ({row["type"]: row for row in terrain["levels"][at::LEVELS]} for at in (0, LEVELS - 1))
+    assert [easiest["waves"][key] for key in ("size", "unit", "worlds", "success")] == [0.02, "m", 1, 1.0]
+    assert hardest["slope_up"]["size"] == pytest.approx(math.radians(30.0), abs=1e-4)
+    assert easiest["waves"]["speed_mps"] == pytest.approx(0.5, abs=0.15)
+    assert easiest["waves"]["cot"] > 0.3
+    # It was trained on the flat, and shuffles: stairs of 24 cm are too much.
+    assert hardest["stairs_up"]["success"] == 0.0
+    assert hardest["stairs_up"]["cot"] is None or math.isnan(hardest["stairs_up"]["cot"])
+    assert terrain["limits"]["stairs_up"] < 0.24
+
+
 def test_the_same_seed_gives_the_same_results(candidate: Candidate, robot: Robot) -> None:
     protocol = dataclasses.replace(PROTOCOL, duration=3.0, skip=1.0)
     a, b = (evaluate(candidate, robot, ("tracking", "gait"), protocol) for _ in range(2))
@@ -98,6 +119,7 @@ def test_every_field_of_the_results_is_described(results: dict[str, Any]) -> Non
     def names(node: Any) -> set[str]:
         if isinstance(node, dict):
             keys = {key for key in node if not re.fullmatch(r"[-\d.]+s?|(right|left)_(hip_roll|hip_pitch|knee)", key)}
+            keys -= set(TYPES)
             return keys.union(*(names(value) for value in node.values()))
         return set().union(*map(names, node)) if isinstance(node, list) else set()
 
@@ -121,6 +143,7 @@ def test_results_are_current_for_the_same_candidate_measured_in_the_same_way(
     assert not is_current(back, candidate, SUITES, dataclasses.replace(PROTOCOL, worlds=5))
     assert not is_current(back, candidate, SUITES, dataclasses.replace(PROTOCOL, push=PushProtocol()))
     assert not is_current(back, candidate, SUITES, dataclasses.replace(PROTOCOL, omni=OmniProtocol()))
+    assert not is_current(back, candidate, SUITES, dataclasses.replace(PROTOCOL, terrain=TerrainProtocol()))
     assert not is_current(back, dataclasses.replace(candidate, fingerprint="of another"), SUITES, PROTOCOL)
     assert not is_current({key: value for key, value in back.items() if key != "gait"}, candidate, SUITES, PROTOCOL)
 
@@ -165,10 +188,10 @@ def test_the_report_shows_the_numbers_beside_the_articles_in_one_file(results: d
         assert speed in text
         assert "0.693" in text  # the article's mean speed at 0.7 m/s
         assert "angular momentum" in text
-    assert page.count("<svg") == 5  # cost of transport, omni, speed, feet, joints: there is no push of ten seconds here
+    assert page.count("<svg") == 6  # cost of transport, omni, terrain, speed, feet, joints; no push of ten seconds
     assert "How &lt;it&gt; walks" in page
     assert not re.search(r"(src|href)=\"http", page)  # complete in itself
-    assert re.findall(r"!\[.*\]\((.*)\)", markdown) == ["cost_of_transport.svg", "omni.svg"]
+    assert re.findall(r"!\[.*\]\((.*)\)", markdown) == ["cost_of_transport.svg", "omni.svg", "terrain.svg"]
     assert (tmp_path / "cost_of_transport.svg").read_text().startswith("<svg")
 
 
