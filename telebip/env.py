@@ -79,6 +79,7 @@ class TelebipEnv(VecEnv):
             model_fields_of(cfg.events),
             sensors_of(cfg.observations),
             (cfg.sim.max_contacts, cfg.sim.max_constraints),
+            cfg.sim.deterministic,
         )
         self.step_dt = cfg.sim.decimation * robot.physics_dt  # [s]
         self.max_episode_length: int = max(1, round(cfg.episode.length / self.step_dt))  # policy steps

@@ -26,6 +26,7 @@ class SimConfig:
     max_contacts: Annotated[int, Quantity(ge=1, le=10_000)]
     max_constraints: Annotated[int, Quantity(ge=1, le=100_000)]
     cuda_graph: bool
+    deterministic: bool  # whether `warp` gives the same bits in every run on a GPU; `native` always does
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,7 @@ def make_simulator(
     model_fields: Sequence[str] = (),
     sensors: Sequence[str] = (),
     capacity: tuple[int, int] = (8, 64),
+    deterministic: bool = False,
 ) -> Simulator:
     """Create the backend.
 
@@ -45,6 +46,7 @@ def make_simulator(
         model_fields: names of `mujoco.MjModel` fields that get one value per world.
         sensors: names of the sensors to keep in `SimState.sensors`.
         capacity: room for contacts and for constraints per world, on `warp`.
+        deterministic: whether `warp` gives the same bits in every run on a GPU; on a CPU both engines always do.
 
     Raises:
         UserError: `native` was asked for on a CUDA device; there is no such field or sensor, or the engine lacks what the
@@ -61,4 +63,4 @@ def make_simulator(
         return NativeSimulator(robot, num_envs, decimation, model_fields, sensors)
     from telebip.sim.warp import WarpSimulator
 
-    return WarpSimulator(robot, num_envs, decimation, indexed(device), model_fields, sensors, *capacity)
+    return WarpSimulator(robot, num_envs, decimation, indexed(device), model_fields, sensors, *capacity, deterministic)

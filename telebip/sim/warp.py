@@ -16,6 +16,7 @@ from telebip.errors import UserError
 from telebip.math import over
 from telebip.robot import FEET, TRUNK, Robot, ground_force_sensor
 from telebip.sim.base import ENGINE_FAULTS, MEANS, Backend, SimState, derives, state_fields
+from telebip.sim.ordering import CanonicalOrder
 
 CAPACITY = int(mjw.OverflowType.ALL & ~(mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS))
 """Overflows that truncate the physics; the MJCF's limits on solver iterations are meant."""
@@ -67,13 +68,16 @@ class WarpSimulator:
         sensors: Sequence[str] = (),
         max_contacts: int = 8,
         max_constraints: int = 64,
+        deterministic: bool = False,
     ) -> None:
         """Create the worlds in the home pose, as `telebip.sim.make_simulator` does, with room for so much in each of them.
 
-        The first use on a machine compiles kernels for a minute or more.
+        The first use on a machine compiles kernels for a minute or more. With `deterministic` no number depends on the order in
+        which a GPU's threads come, see `telebip.sim.ordering`.
 
         Raises:
-            UserError: the engine lacks something of the robot, or has one value of a field for all worlds.
+            UserError: the engine lacks something of the robot, or has one value of a field for all worlds, or cannot be
+                deterministic with it.
         """
         self.num_envs, self.device = num_envs, device
         self.model = robot.engine_model(sensors)
@@ -90,6 +94,9 @@ class WarpSimulator:
                 raise UserError(f"{robot.path}: backend 'warp': {error}") from error
             self.mjw_model.opt.warn_overflow = 0  # `faults` has them
             self.mjw_data = mjw.make_data(self.model, nworld=num_envs, nconmax=max_contacts, njmax=max_constraints)
+            if deterministic:
+                self.mjw_model.opt.deterministic = True
+                CanonicalOrder(self.mjw_model, self.mjw_data)
             self._schedule = [wp.zeros_like(self.mjw_data.ctrl) for _ in range(decimation)]  # controls of each physics step
         data = self.mjw_data
         self.model_fields = {name: wp.to_torch(getattr(self.mjw_model, name)) for name in model_fields}
