@@ -39,7 +39,7 @@ class CudaGraph(Generic[Result]):
 
     def _record(self) -> tuple[torch.cuda.CUDAGraph, Result]:
         stream = torch.cuda.current_stream(self._device)
-        with torch.cuda.device(self._device), torch.inference_mode(False), torch.no_grad(), _no_garbage_collection():
+        with torch.cuda.device(self._device), torch.inference_mode(False), torch.no_grad(), no_garbage_collection():
             graph = torch.cuda.CUDAGraph()
             graph.register_generator_state(self._generator)
             try:
@@ -58,7 +58,7 @@ class CudaGraph(Generic[Result]):
 
 
 @contextlib.contextmanager
-def _no_garbage_collection() -> Iterator[None]:
+def no_garbage_collection() -> Iterator[None]:
     """Collect garbage now and not in between: finalizers free memory and graphs, which a recording forbids."""
     gc.collect()
     was_enabled = gc.isenabled()

@@ -88,7 +88,7 @@ def test_imports_point_one_way(file: Path) -> None:
     ("engine", "owners"),
     [
         ("mujoco_warp", {"telebip.sim.warp", "telebip.tools.engines"}),  # tools measure the engine without the rest
-        ("warp", {"telebip.sim.warp", "telebip.tools.engines"}),
+        ("warp", {"telebip.sim.warp", "telebip.sim.ordering", "telebip.tools.engines"}),
         ("rerun", {"telebip.viz.rerun", "telebip.viz.blueprint", "telebip.viz.live"}),
     ],
 )

@@ -13,6 +13,7 @@ import warp as wp
 from torch import Tensor
 
 from telebip.errors import UserError
+from telebip.graph import no_garbage_collection
 from telebip.math import over
 from telebip.robot import FEET, TRUNK, Robot, ground_force_sensor
 from telebip.sim.base import ENGINE_FAULTS, MEANS, Backend, SimState, derives, state_fields
@@ -51,6 +52,30 @@ def _accumulate(
     if i == 0:
         foot_force[world, 0] -= scale * sensordata[world, right_adr]
         foot_force[world, 1] -= scale * sensordata[world, left_adr]
+
+
+class EngineGraph:
+    """Work of the engine recorded as a CUDA graph, which is replayed on torch's current stream."""
+
+    def __init__(self, work: Callable[[], None], device: torch.device) -> None:
+        """Do the work once, which compiles and loads its kernels, and record it; the device is idle before and after."""
+        self._device, wp_device = device, wp.device_from_torch(device)
+        self._streams: dict[int, wp.Stream] = {}
+        torch.cuda.synchronize(device)  # the work below is on Warp's own stream
+        with wp.ScopedDevice(wp_device):
+            work()
+            with no_garbage_collection(), wp.ScopedCapture() as capture:
+                work()
+        wp.synchronize_device(wp_device)
+        self._graph: wp.Graph = capture.graph  # type: ignore[assignment]
+
+    def __call__(self) -> None:
+        """Do the work again, in order with torch's work before and after and without a synchronisation."""
+        with torch.cuda.device(self._device):  # the default stream's handle means that of the current device
+            stream = torch.cuda.current_stream(self._device)
+            if stream.cuda_stream not in self._streams:
+                self._streams[stream.cuda_stream] = wp.stream_from_torch(stream)
+            wp.capture_launch(self._graph, stream=self._streams[stream.cuda_stream])
 
 
 class WarpSimulator:
@@ -125,7 +150,7 @@ class WarpSimulator:
             "capacity": f"raise sim.max_contacts ({max_contacts}) or sim.max_constraints ({max_constraints}), both per world"
         }
         self.faults = torch.zeros(len(ENGINE_FAULTS), num_envs, dtype=torch.bool, device=device)  # warns of nothing else
-        self._graphs: dict[Callable[[], None], wp.Graph] = {}
+        self._graphs: dict[Callable[[], None], EngineGraph] = {}
         if self._wp_device.is_cuda:
             self._graphs[self._hold] = self._record(self._hold)
         home = torch.as_tensor(robot.home_qpos, dtype=torch.float32, device=device).expand(num_envs, -1)
@@ -202,20 +227,13 @@ class WarpSimulator:
             return
         if work not in self._graphs:
             self._graphs[work] = self._record(work)
-        # On torch's stream, so that torch's work before and after is ordered with it without a synchronisation.
-        with torch.cuda.device(self.device):  # the default stream's handle means that of the current device
-            wp.capture_launch(self._graphs[work], stream=wp.stream_from_torch(torch.cuda.current_stream(self.device)))
+        self._graphs[work]()
 
-    def _record(self, work: Callable[[], None]) -> wp.Graph:
-        """Record a CUDA graph. Doing the work once compiles and loads its kernels before; the worlds stay where they are."""
+    def _record(self, work: Callable[[], None]) -> EngineGraph:
+        """Record a CUDA graph; the worlds stay where they are."""
         memory = {name: live.clone() for name, live in self.memory.items()}
-        torch.cuda.synchronize(self.device)
-        with wp.ScopedDevice(self._wp_device):
-            work()
-            with wp.ScopedCapture() as capture:
-                work()
-        wp.synchronize_device(self._wp_device)  # from here on everything runs on torch's stream
+        graph = EngineGraph(work, self.device)
         for name, live in self.memory.items():
             live.copy_(memory[name])
         self._overflow.zero_()  # that of a step that nobody asked for
-        return capture.graph  # type: ignore[return-value]
+        return graph

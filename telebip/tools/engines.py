@@ -4,6 +4,7 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -91,6 +92,8 @@ def _warp(sim: Any, steps: int) -> tuple:
     import mujoco_warp as mjw
     import warp as wp
 
+    from telebip.sim.warp import EngineGraph
+
     model, data = sim.mjw_model, sim.mjw_data
     device = wp.device_from_torch(sim.device)
 
@@ -99,17 +102,14 @@ def _warp(sim: Any, steps: int) -> tuple:
             for _ in range(steps):
                 mjw.step(model, data)
 
-    run = launch
-    if device.is_cuda:
-        launch()
-        with wp.ScopedCapture(device=device) as capture:
-            launch()
-        wp.synchronize_device(device)
-        graph: Any = capture.graph
-
-        def run() -> None:
-            with torch.cuda.device(sim.device):  # the default stream's handle means that of the current device
-                wp.capture_launch(graph, stream=wp.stream_from_torch(torch.cuda.current_stream(sim.device)))
-
+    run = EngineGraph(launch, sim.device) if device.is_cuda else launch
     ctrl, xfrc, overflow = (wp.to_torch(array) for array in (data.ctrl, data.xfrc_applied, data.overflow))
     return ctrl, xfrc, overflow, run
+
+
+def compiled_kernel_modules() -> int:
+    """Return how many modules of kernels Warp has compiled on this machine and keeps for later processes."""
+    import warp as wp
+
+    wp.init()
+    return sum(path.is_dir() for path in Path(wp.config.kernel_cache_dir).glob("*"))

@@ -1,6 +1,7 @@
 """Training on a GPU, end to end: `pytest -m gpu` on a machine that has one."""
 
 import math
+import warnings
 from pathlib import Path
 
 import pytest
@@ -48,6 +49,38 @@ def test_a_rollout_never_waits_for_the_device(robot: Robot, tmp_path: Path) -> N
             running.collect(obs)
         finally:
             torch.cuda.set_sync_debug_mode("default")
+
+
+def test_an_update_waits_for_the_device_once_at_its_end(robot: Robot, tmp_path: Path) -> None:
+    """For its losses; the learning rate adapts on the device, and Adam is the fused one."""
+    running = trainer(robot, tmp_path, 1)
+    running.iterate()
+    with torch.inference_mode():
+        obs, _ = running.collect(running.view.get_observations())
+        running.learner.compute_returns(obs)
+    torch.cuda.synchronize()
+    torch.cuda.set_sync_debug_mode("warn")
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            running.learner.update()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    waits = [str(warning.message) for warning in caught if "synchronizing CUDA operation" in str(warning.message)]
+    assert len(waits) == 1
+    assert all(group["fused"] and group["lr"].is_cuda for group in running.learner.optimizer.param_groups)
+
+
+def test_the_same_seed_trains_the_same_policy_bit_for_bit(robot: Robot, tmp_path: Path) -> None:
+    config = load_task("telebip_flat", [*SMALL, "sim.deterministic=true", "ppo.max_iterations=3"])
+    weights = []
+    for _ in range(2):
+        running = Trainer(TelebipEnv(config, robot, "cuda", "auto"), "telebip_flat", tmp_path)
+        for _ in range(3):
+            running.iterate()
+        weights.append({name: value.clone() for name, value in running.learner.get_policy().state_dict().items()})
+    for name, value in weights[0].items():
+        assert torch.equal(value, weights[1][name]), name
 
 
 def test_a_policy_acts_alike_on_both_devices(robot: Robot) -> None:
