@@ -1,5 +1,5 @@
 # pyright: reportGeneralTypeIssues=false, reportIndexIssue=false, reportOperatorIssue=false, reportArgumentType=false
-# pyright: reportAssignmentType=false
+# pyright: reportAssignmentType=false, reportCallIssue=false, reportAttributeAccessIssue=false
 """Contacts and constraint rows of MuJoCo Warp in an order that does not depend on which GPU thread came first.
 
 Threads take places in the list of contacts, and in a world's constraint rows, from atomic counters. The solver's float32

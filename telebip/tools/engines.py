@@ -112,4 +112,4 @@ def compiled_kernel_modules() -> int:
     import warp as wp
 
     wp.init()
-    return sum(path.is_dir() for path in Path(wp.config.kernel_cache_dir).glob("*"))
+    return sum(path.is_dir() for path in Path(wp.config.kernel_cache_dir or "").glob("*"))

@@ -216,7 +216,7 @@ def _profile(check: Check, name: str, function: Callable[[], Any]) -> None:
     calls: Counter[str] = Counter()
     kernels: Counter[str] = Counter()
     for event in found.key_averages():
-        is_host = event.device_type == torch.autograd.DeviceType.CPU
+        is_host = event.device_type.name == "CPU"
         if is_host and (re.match(r"cu(da)?[A-Z]", event.key) or event.key == "aten::_local_scalar_dense"):
             calls[event.key] += event.count
         if is_host == (check.device.type == "cpu"):
@@ -307,12 +307,14 @@ def compiled(check: Check) -> None:
 def _fuse(env: TelebipEnv) -> None:
     """Let torch.compile fuse what a step does around the physics; on CUDA a graph then replays that."""
     backend = "inductor" if env.device.type == "cuda" else "aot_eager"  # which compiles nothing, in a few seconds
-    functions = [torch.compile(f, dynamic=False, backend=backend) for f in (env._prepare_step, env._finish_step)]
-    env._before_physics, env._after_physics = functions
+    before = torch.compile(env._prepare_step, dynamic=False, backend=backend)
+    after = torch.compile(env._finish_step, dynamic=False, backend=backend)
+    env._before_physics, env._after_physics = before, after
     for _ in range(3):  # compiles, and compiles again where it has learned more, which a recording cannot
         env.step(torch.zeros(env.num_envs, env.num_actions, device=env.device))
     if env._is_recorded:
-        env._before_physics, env._after_physics = (CudaGraph(f, env.device, env.generator) for f in functions)
+        env._before_physics = CudaGraph(before, env.device, env.generator)
+        env._after_physics = CudaGraph(after, env.device, env.generator)
 
 
 def precision(check: Check) -> None:
