@@ -337,11 +337,11 @@ STEPS: dict[str, tuple[Callable[[Check], None], float]] = {
     "tests": (tests, 2.5),
     "quick": (quick, 1.0),
     "speed": (speed, 2.0),
-    "profile": (profile, 0.5),
+    "profile": (profile, 1.0),
     "flat": (flat, 2.0),
-    "determinism": (determinism, 1.0),
+    "determinism": (determinism, 1.5),
     "tasks": (tasks, 0.5),
-    "precision": (precision, 0.5),
+    "precision": (precision, 1.0),
     "compiled": (compiled, 1.0),
 }
 """Name -> the step, and its share of the time; in order of worth."""
