@@ -19,8 +19,8 @@ from telebip.rollout import Rollout
 from telebip.sim import Backend, SimState, Simulator, make_simulator
 
 FORMAT = "telebip-fault-2"
-RECORD = {"step", "world", "action", "targets", "wrench_w", "time", "qpos", "qvel", "qacc_warmstart"}
-"""What a fault's record holds at least: all that the outcome of a step depends on, beside the fields of the model."""
+RECORD = {"step", "world", "action", "targets", "wrench_w"}
+"""What a fault's record holds beside the engine's whole state and the fields of the model."""
 STATE = ("qpos", "qvel", "joint_pos", "foot_force", "joint_force", "joint_power", "joint_net_power")
 """What of a state is kept for the rollout."""
 
@@ -33,7 +33,7 @@ class Fault:
     config: TaskConfig
     backend: Backend
     model_fields: list[str]  # names of those that had a value per world
-    record: dict[str, Tensor]  # of one world: of `RECORD`, of the engine's memory and of the fields of the model
+    record: dict[str, Tensor]  # of one world: `RECORD`, `Simulator.memory` and the fields of the model
 
 
 @dataclass(frozen=True)
@@ -97,6 +97,7 @@ def save_fault(run_dir: Path, kind: str, record: dict[str, Tensor], task: str, e
         "seed": env.cfg.seed,
         "backend": env.sim.backend,
         "model_fields": list(env.sim.model_fields),
+        "memory": list(env.sim.memory),
     }
     save_archive(file, {**about, "record": record})
     return file
@@ -111,16 +112,16 @@ def load_fault(path: str | Path) -> Fault:
     content = load_archive(Path(path), "fault", FORMAT)
     if content.get("kind") not in KINDS:
         raise UserError(f"fault '{path}': this version knows no '{content.get('kind')}'")
-    record, fields = content.get("record"), content.get("model_fields")
+    record, fields, memory = (content.get(name) for name in ("record", "model_fields", "memory"))
     if (
         not isinstance(fields, list)
+        or not isinstance(memory, list)
         or content.get("backend") not in ("native", "warp")
         or not isinstance(content.get("config"), str)
     ):
-        raise UserError(f"fault '{path}' is not complete: it lacks its engine or its configuration")
-    if not (
-        isinstance(record, dict) and record.keys() >= {*RECORD, *fields} and all(isinstance(x, Tensor) for x in record.values())
-    ):
+        raise UserError(f"fault '{path}' is not complete: it lacks its engine, its configuration or names")
+    needed = {*RECORD, *fields, *memory}
+    if not (isinstance(record, dict) and record.keys() >= needed and all(isinstance(x, Tensor) for x in record.values())):
         raise UserError(f"fault '{path}' is not complete: of the step's beginning it lacks something")
     config = parse_config(content["config"], f"{path}:config", missing=[])  # physics needs no terms
     return Fault(content["kind"], config, content["backend"], fields, record)

@@ -24,6 +24,8 @@ NET_FORCE = 3
 """MuJoCo's number of a contact sensor's `reduce="netforce"`."""
 
 HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+DYNAMICS = [int(kind) for kind in (mujoco.mjtDyn.mjDYN_NONE, mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT)]
+"""Of an actuator whose control is where the joint is to go: at once, or through a first-order filter."""
 MIRROR = np.array([1.0, -1.0, 1.0])
 """Reflection of a polar vector at the plane y = 0; an axial one is reflected by its negative."""
 
@@ -143,7 +145,8 @@ def load_robot(path: str | Path) -> Robot:
 
     The MJCF must name the body `trunk` with a free joint, which comes first, a touch sensor `<foot>_force` for each of `FEET`,
     the geom `floor`, and the keyframe `home`. All other joints are hinges and slides. Every actuator is a position actuator
-    with a force range, on a named joint with a range; a joint may have none. See docs/your_robot.md.
+    with a force range, on a named joint with a range, at once or through a filter; a joint may have none. See
+    docs/your_robot.md.
 
     Raises:
         UserError: the file is missing or is no valid MJCF, or something is missing or of another kind; the message says what.
@@ -210,8 +213,8 @@ def _check_actuators(model: mujoco.MjModel, path: str | Path) -> None:
             (model.jnt_limited[joint.id], f"joint '{joint.name}' needs a range"),
             (_is_position(model, i), f"actuator '{name}' must be a position actuator: its control is a joint target"),
             (
-                model.actuator_dyntype[i] == mujoco.mjtDyn.mjDYN_NONE,
-                f"actuator '{name}' must act at once: no time constant or other activation dynamics",
+                model.actuator_dyntype[i] in DYNAMICS,
+                f"actuator '{name}' must act at once or through a filter (timeconst), not through other activation dynamics",
             ),
             (model.actuator_gear[i, 0] == 1.0, f"actuator '{name}' must have a gear of 1"),
             (model.actuator_forcelimited[i], f"actuator '{name}' needs a forcerange"),
@@ -300,7 +303,8 @@ def _mirror(model: mujoco.MjModel, trunk: int, home: NDArray[np.float64], sites:
             a, b = actuator[i], actuator[j]
             if not _same(model.actuator_forcerange[a], np.sort(signed * model.actuator_forcerange[b])):
                 return f"force limits of {pair}"
-            if not all(_same(prm[a], prm[b]) for prm in (model.actuator_gainprm, model.actuator_biasprm)):
+            parameters = model.actuator_gainprm, model.actuator_biasprm, model.actuator_dynprm
+            if not all(_same(own[a], own[b]) for own in parameters):
                 return f"gains of {pair}"
             order[a], sign[a] = b, signed
     if not _mirrors(moments[trunk], moments[trunk]):

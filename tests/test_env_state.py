@@ -5,14 +5,27 @@ from pathlib import Path
 
 import pytest
 import torch
-from worlds import MORE_EVENTFUL, MakeEnv, random_actions, same
+from worlds import CALM, MORE_EVENTFUL, MakeEnv, random_actions, same, write_stateful
 
+from telebip.config import load_task
+from telebip.env import TelebipEnv
+from telebip.robot import Robot, load_robot
 from telebip.sim import Backend
 
 
+@pytest.fixture(params=["telebip", "stateful"])
+def any_robot(request: pytest.FixtureRequest, robot: Robot, tmp_path: Path) -> Robot:
+    """Telebip as it is, and with filters, delays and so on: with more state than positions and velocities."""
+    return robot if request.param == "telebip" else load_robot(write_stateful(robot.path, tmp_path))
+
+
+def make(robot: Robot, backend: Backend, *overrides: str, num_envs: int = 4) -> TelebipEnv:
+    return TelebipEnv(load_task("telebip_flat", [f"num_envs={num_envs}", *overrides]), robot, "cpu", backend)
+
+
 @pytest.mark.parametrize("backend", ["native", "warp"])
-def test_a_state_is_gone_on_from_bit_for_bit(make_env: MakeEnv, tmp_path: Path, backend: Backend) -> None:
-    first, second = (make_env(*MORE_EVENTFUL, f"seed={seed}", backend=backend) for seed in (1, 2))
+def test_a_state_is_gone_on_from_bit_for_bit(any_robot: Robot, tmp_path: Path, backend: Backend) -> None:
+    first, second = (make(any_robot, backend, *MORE_EVENTFUL, f"seed={seed}") for seed in (1, 2))
     actions = random_actions(40, 4, 0.7)
     for action in actions[:9]:
         first.step(action)
@@ -48,6 +61,22 @@ def test_what_was_last_seen_is_seen_again_after_loading(make_env: MakeEnv, backe
     same(second.get_observations(), obs)
     same(first.get_observations(), obs)
     same(first.step(torch.ones(4, 6)), second.step(torch.ones(4, 6)))
+
+
+@pytest.mark.parametrize("backend", ["native", "warp"])
+def test_a_world_that_is_reset_is_a_new_one(any_robot: Robot, backend: Backend) -> None:
+    """Same start, same actions: the step after a reset is that of a world that was never used."""
+    calm = ("events.start_pose=null", "events.start_velocity=null", *CALM, "episode.length=0.2")
+    old, new = make(any_robot, backend, *calm), make(any_robot, backend, *calm)
+    for env in (old, new):
+        env.set_command(0.7, 0.0, 0.0)
+    for action in random_actions(10, 4, 0.7):
+        dones = old.step(action)[2]
+    assert dones.all()  # by time-out, or before
+    same(dict(old.sim.memory.items()), dict(new.sim.memory.items()))
+    action = random_actions(1, 4, 0.7, seed=1)[0]
+    same(old.step(action)[0]["policy"], new.step(action)[0]["policy"])
+    same(old.sim.state.joint_force, new.sim.state.joint_force)
 
 
 @pytest.mark.parametrize(

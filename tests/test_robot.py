@@ -324,7 +324,10 @@ def test_broken_mjcf_is_one_line_that_names_the_file(tmp_path: Path, text: str) 
         ({'forcerange="-400 400"': ""}, "actuator 'right_knee' needs a forcerange"),
         ({'range="-0.15 0.20" ': ""}, "joint 'right_knee' needs a range"),
         ({'<position name="left_knee"': '<motor name="left_knee"'}, "actuator 'left_knee' must be a position actuator"),
-        ({'<position name="left_knee"': '<position timeconst="0.1" name="left_knee"'}, "actuator 'left_knee' must act at once"),
+        (
+            {'<position name="left_knee"': '<intvelocity kp="9" actrange="-1 1" name="left_knee"'},
+            "'left_knee' must act at once",
+        ),
         ({'<position name="left_knee"': '<position gear="2" name="left_knee"'}, "actuator 'left_knee' must have a gear of 1"),
         ({'name="left_knee" joint="left_knee"': 'name="left_knee" site="imu"'}, "actuator 'left_knee' must drive one joint"),
         ({'joint="left_knee"': 'joint="right_knee"'}, "joint 'right_knee' has a second actuator, 'left_knee'"),

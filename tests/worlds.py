@@ -1,6 +1,7 @@
 """What tests do to worlds: act, observe, put robots into states, watch the operators that a step runs."""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -41,6 +42,30 @@ ROUGH = (
     *("sim.max_contacts=16", "sim.max_constraints=96"),
 )
 """The same on rough ground, whose tiles are soon left."""
+
+
+STATEFUL = {
+    "<option ": '<size nuserdata="3"/><option ',
+    '<position name="left_knee"': '<position timeconst="0.03" name="left_knee"',
+    '<position name="left_hip_roll"': '<general dyntype="filter" dynprm="0.02" gainprm="200" biastype="affine" '
+    'biasprm="0 -200 -6" forcerange="-50 50" name="left_hip_roll"',
+    '<position name="right_hip_pitch"': '<position delay="0.012" nsample="4" name="right_hip_pitch"',
+    '<joint name="right_knee"': '<joint stiffness="50" springyield="0.01" name="right_knee"',
+    '<key name="home"': '<key act="0.02 0.04" mpos="0.2 0 0.7" name="home"',
+    "</worldbody>": '<body name="hand" mocap="true" pos="0.2 0 0.8"/></worldbody>'
+    '<equality><weld name="grip" body1="hand" body2="trunk" active="false" solref="0.1 1"/></equality>',
+}
+"""What gives the robot filters, a delay, a spring that yields, a mocap body, a weld to it that is off, and user data."""
+
+
+def write_stateful(mjcf: Path, folder: Path) -> Path:
+    """Write telebip's MJCF with every kind of state but that of plugins to a folder, and return its path."""
+    text = mjcf.read_text()
+    for before, after in STATEFUL.items():
+        assert before in text
+        text = text.replace(before, after, 1)
+    (folder / "stateful.xml").write_text(text)
+    return folder / "stateful.xml"
 
 
 def random_actions(steps: int, num_envs: int, scale: float = 1.0, seed: int = 0) -> Tensor:

@@ -3,14 +3,16 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal, Protocol
 
 import mujoco
 import torch
 from torch import Tensor
 
+from telebip.errors import UserError
 from telebip.math import zeros
-from telebip.robot import FEET, Robot
+from telebip.robot import FEET, KEYFRAME, Robot
 
 Backend = Literal["auto", "native", "warp"]
 
@@ -133,7 +135,8 @@ class Simulator(Protocol):
     def reset(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
         """Overwrite the worlds where `mask` (num_envs,) holds with rows of `qpos` (num_envs, nq) and `qvel` (num_envs, nv).
 
-        A reset world has no memory: its next step is the same, bit for bit, as that of a new simulator in that state.
+        All else of its state is that of the keyframe `home`. A reset world has no memory: its next step is the same, bit for
+        bit, as that of a new simulator in that state.
         """
         ...
 
@@ -144,6 +147,27 @@ class Simulator(Protocol):
     def refresh_constants(self, mask: Tensor) -> None:
         """Bring what MuJoCo derives from `model_fields` (mj_setConst) up to date, at least where `mask` (num_envs,) holds."""
         ...
+
+
+def home_data(model: mujoco.MjModel) -> mujoco.MjData:
+    """Return C MuJoCo's data in the keyframe `home`, with the activations, mocap poses and so on that it gives."""
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.key(KEYFRAME).id)
+    return data
+
+
+def require_whole_state(model: mujoco.MjModel, path: Path) -> None:
+    """Refuse options with which MuJoCo keeps more than its state: no world could then be reset or gone on from.
+
+    Raises:
+        UserError: the MJCF has one.
+    """
+    for flag in ("sleep", "ipc"):
+        if model.opt.enableflags & getattr(mujoco.mjtEnableBit, f"mjENBL_{flag.upper()}"):
+            raise UserError(
+                f'{path}: take out <flag {flag}="enable"/>: what it remembers is no part of MuJoCo\'s state, so that no world '
+                "can be reset, and no run resumed"
+            )
 
 
 def state_fields(model: mujoco.MjModel) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ from mujoco.batch import Batch, SimulationError
 from torch import Tensor
 
 from telebip.robot import FEET, TRUNK, Robot, ground_force_sensor
-from telebip.sim.base import ENGINE_FAULTS, Backend, SimState, derives, state_fields
+from telebip.sim.base import ENGINE_FAULTS, Backend, SimState, derives, home_data, require_whole_state, state_fields
 
 CAPACITY = [mujoco.mjtWarning.mjWARN_CONTACTFULL.value, mujoco.mjtWarning.mjWARN_CNSTRFULL.value]
 """Warnings of an arena that is too small: the MJCF's `<size memory="..."/>`."""
@@ -35,6 +35,7 @@ class NativeSimulator:
         self.num_envs = num_envs
         self.device = torch.device("cpu")
         self.model = robot.engine_model(sensors)
+        require_whole_state(self.model, robot.path)
         # A non-finite state stays, to be seen and counted by the environment; the engine would silently reset it.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.state = SimState.zeros(robot, num_envs, self.device, sensors)
@@ -46,7 +47,8 @@ class NativeSimulator:
         self.advice = {"capacity": 'raise <size memory="..."/> in the MJCF'}
         self._derives = derives(model_fields)
         self._decimation = decimation
-        self._default = self.batch.state[0].copy()  # the engine's whole state, as mj_resetData leaves it
+        self._default = np.empty(self.batch.nstate)  # the engine's whole state in the keyframe `home`
+        mujoco.mj_getState(self.model, home_data(self.model), self._default, mujoco.mjtState.mjSTATE_INTEGRATION)
         self._ctrl = torch.from_numpy(self.batch.bind("ctrl"))
         self._trunk_wrench = torch.from_numpy(self.batch.bind("xfrc_applied"))[:, self.model.body(TRUNK).id]
         # Every physics step's values, (num_envs, decimation, ...), written by the engine's threads.

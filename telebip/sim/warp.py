@@ -16,7 +16,7 @@ from telebip.errors import UserError
 from telebip.graph import no_garbage_collection
 from telebip.math import over
 from telebip.robot import FEET, TRUNK, Robot, ground_force_sensor
-from telebip.sim.base import ENGINE_FAULTS, MEANS, Backend, SimState, derives, state_fields
+from telebip.sim.base import ENGINE_FAULTS, MEANS, Backend, SimState, derives, home_data, require_whole_state, state_fields
 from telebip.sim.ordering import CanonicalOrder
 
 CAPACITY = int(mjw.OverflowType.ALL & ~(mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS))
@@ -106,6 +106,7 @@ class WarpSimulator:
         """
         self.num_envs, self.device = num_envs, device
         self.model = robot.engine_model(sensors)
+        require_whole_state(self.model, robot.path)
         self._decimation = decimation
         self._derives = derives(model_fields)
         wp.config.log_level = wp.LOG_WARNING  # not a line for each of a hundred kernels
@@ -128,7 +129,7 @@ class WarpSimulator:
         # Equality constraints read the velocities that bodies had in the step before.
         fields = (*state_fields(self.model), *(("cvel",) if self.model.neq else ()))
         self.memory = {name: wp.to_torch(getattr(data, name)) for name in fields}
-        self._default = {name: live.clone() for name, live in self.memory.items()}  # as mj_resetData leaves them
+        self._default = self._home()
         self._live = [getattr(data, name) for name in self.memory]
         self._copies = [wp.clone(array) for array in self._live]
         self.memory_before = {name: wp.to_torch(copy) for name, copy in zip(self.memory, self._copies, strict=True)}
@@ -156,6 +157,14 @@ class WarpSimulator:
         home = torch.as_tensor(robot.home_qpos, dtype=torch.float32, device=device).expand(num_envs, -1)
         everywhere = torch.ones(num_envs, dtype=torch.bool, device=device)
         self.reset(everywhere, home, torch.zeros(num_envs, self.model.nv, device=device))
+
+    def _home(self) -> dict[str, Tensor]:
+        """Return `memory` as it is in the keyframe `home`, at rest."""
+        data, home = home_data(self.model), {}
+        for name, live in self.memory.items():
+            value = torch.as_tensor(getattr(data, name), dtype=live.dtype, device=live.device)
+            home[name] = value.reshape(live.shape[1:]).expand_as(live).clone()
+        return home
 
     def step(self, targets: Tensor, wrench_w: Tensor) -> SimState:
         """See `Simulator.step`."""

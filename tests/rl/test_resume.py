@@ -13,7 +13,9 @@ from pathlib import Path
 import pytest
 import torch
 from processes import FORKS
+from worlds import write_stateful
 
+from telebip import ROOT
 from telebip.cli.common import run
 from telebip.errors import UserError
 from telebip.rl.checkpoint import load_checkpoint
@@ -26,11 +28,13 @@ BUSY = ("events.push.interval=[0.1,0.3]", "commands.resampling_time=0.2", "ppo.s
 class Training:
     """`train.py` in a process of its own."""
 
-    def __init__(self, tmp_path: Path, *arguments: str, before: Callable[[], None] | None = None) -> None:
-        """Start it; `before` is called in it first."""
+    def __init__(
+        self, tmp_path: Path, *arguments: str, before: Callable[[], None] | None = None, after: tuple[str, ...] = ()
+    ) -> None:
+        """Start it; `before` is called in it first, and the overrides `after` come last."""
         self.output_file = tmp_path / f"output_{time.monotonic_ns()}"
         self.process: ForkServerProcess = FORKS.Process(
-            target=_train, args=(self.output_file, [*arguments, *SMALL, *BUSY], before)
+            target=_train, args=(self.output_file, [*arguments, *SMALL, *BUSY, *after], before)
         )
         self.process.start()
 
@@ -152,6 +156,22 @@ def assert_killing_changes_nothing(tmp_path: Path, iterations: int, kills: int, 
 
 def test_a_killed_training_goes_on_bit_for_bit(tmp_path: Path) -> None:
     assert_killing_changes_nothing(tmp_path, iterations=40, kills=3, wait=0.1)
+
+
+def test_a_robot_with_filters_delays_and_mocap_bodies_goes_on_bit_for_bit(tmp_path: Path) -> None:
+    robot = f"sim.robot={write_stateful(ROOT / 'assets' / 'telebip.xml', tmp_path)}"
+    own = (robot, "ppo.symmetry=none")  # its right knee alone has a spring
+    folders = []
+    for name, ends in (("whole", [6]), ("interrupted", [2, 6])):
+        Training(tmp_path, *new(tmp_path / name, ends[0]), after=own).finish()
+        folders.append(run_dir(tmp_path / name))
+        for end in ends[1:]:
+            Training(tmp_path, *resumed(folders[-1], end), after=own).finish()
+    whole, interrupted = (load_checkpoint(folder / "model_6.pt") for folder in folders)
+    assert {"act", "history", "plastic", "mocap_pos"} <= whole.training[0]["env"]["sim"].keys()
+    assert same(whole.learner, interrupted.learner)
+    assert same(whole.training, interrupted.training)
+    assert curve(folders[0]) == curve(folders[1])
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from worlds import write_stateful
 
 from telebip import ROOT
 from telebip.errors import UserError
@@ -119,7 +120,8 @@ def mj_rollout(
     """Step every world with C MuJoCo from `qpos`, `qvel`; FIELDS and sensors after each policy step, (steps, num_envs, ...)."""
     out: dict[str, list[list[NDArray[np.float64]]]] = {name: [] for name in (*FIELDS, *sensors)}
     worlds = [mujoco.MjData(model) for model in models]
-    for data, position, velocity in zip(worlds, qpos, qvel, strict=True):
+    for model, data, position, velocity in zip(models, worlds, qpos, qvel, strict=True):
+        mujoco.mj_resetDataKeyframe(model, data, model.key("home").id)
         data.qpos[:], data.qvel[:] = position, velocity
     for target, wrench in zip(targets, wrenches, strict=True):
         rows: dict[str, list[NDArray[np.float64]]] = {name: [] for name in out}
@@ -434,37 +436,22 @@ def test_what_mujoco_derives_follows_the_mass_of_each_world(make: Make, backend:
         np.testing.assert_allclose(actual, [getattr(model, name) for model in models], rtol=1e-4, atol=1e-7, err_msg=name)
 
 
-STATEFUL = {
-    "<option ": '<size nuserdata="3"/><option ',
-    '<position name="left_knee"': '<position timeconst="0.03" name="left_knee"',
-    "</worldbody>": '<body name="hand" mocap="true" pos="0.2 0 0.8"/></worldbody>'
-    '<equality><weld name="grip" body1="hand" body2="trunk" active="false" solref="0.1 1"/></equality>',
-}
-"""What gives the robot an activation, a mocap body, a weld to it that is off, and user data."""
-
-
 @pytest.fixture
-def stateful(robot: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Robot:
-    """Return telebip with every kind of state; `load_robot` refuses activations as yet."""
-    text = robot.path.read_text()
-    for before, after in STATEFUL.items():
-        assert before in text
-        text = text.replace(before, after, 1)
-    (tmp_path / "stateful.xml").write_text(text)
-    monkeypatch.setattr("telebip.robot._check_actuators", lambda *_: None)
-    return load_robot(tmp_path / "stateful.xml")
+def stateful(robot: Robot, tmp_path: Path) -> Robot:
+    return load_robot(write_stateful(robot.path, tmp_path))
 
 
 def test_memory_is_the_engine_s_whole_state(make: Make, backend: tuple[Backend, str], stateful: Robot) -> None:
-    """Whatever MuJoCo calls state is reset to its defaults, kept and gone on from."""
+    """Whatever MuJoCo calls state is reset to that of the keyframe, kept and gone on from."""
     robot = stateful
     size = mujoco.mj_stateSize(stateful.model, mujoco.mjtState.mjSTATE_INTEGRATION)
     sim, new = make(robot=robot), make(robot=robot)
-    assert {"act", "eq_active", "mocap_pos", "mocap_quat", "userdata"} < sim.memory.keys()
+    assert {"act", "history", "plastic", "eq_active", "mocap_pos", "mocap_quat", "userdata"} < sim.memory.keys()
     numbers = sum(value[0].numel() for name, value in sim.memory.items() if name != "cvel")
     assert numbers == size - robot.model.nu - 6 * robot.model.nbody  # of controls and external forces
     default = {name: value.clone() for name, value in sim.memory.items()}
-    np.testing.assert_allclose(default["mocap_pos"][0].cpu().reshape(-1), [0.2, 0.0, 0.8], rtol=1e-6)
+    np.testing.assert_allclose(default["mocap_pos"][0].cpu().reshape(-1), [0.2, 0.0, 0.7], rtol=1e-6)
+    np.testing.assert_allclose(default["act"][0].cpu(), [0.02, 0.04], rtol=1e-6)
 
     sim.memory["eq_active"].fill_(1)
     sim.memory["mocap_pos"] += 0.1
@@ -530,6 +517,56 @@ def test_an_unknown_field_or_sensor_is_one_line(make: Make) -> None:
         make(sensors=("gyr",))
 
 
+def refusal(path: Path, backend: Backend, sensors: Sequence[str] = ()) -> str:
+    """Return the one line that names the robot's file."""
+    with pytest.raises(UserError) as caught:
+        make_simulator(backend, load_robot(path), 2, DECIMATION, torch.device("cpu"), sensors=sensors)
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ")
+    assert len(message.splitlines()) == 1
+    return message
+
+
+@pytest.mark.parametrize(
+    ("option", "line"),
+    [
+        ('><flag sleep="enable"/></option>', 'take out <flag sleep="enable"/>: what it remembers is no part of'),
+        (
+            ' integrator="discrete"><flag ipc="enable"/></option>',
+            'take out <flag ipc="enable"/>: what it remembers is no part of',
+        ),
+    ],
+)
+@pytest.mark.parametrize("backend", ["native", "warp"])
+def test_what_remembers_more_than_its_state_is_refused(backend: Backend, tmp_path: Path, option: str, line: str) -> None:
+    """Sleep and IPC keep what mjSTATE_INTEGRATION does not have; on `warp`, sleep ended the process."""
+    text = (ROOT / "assets/telebip.xml").read_text()
+    changed, edits = re.subn(r'(<option [^>]*?) integrator="implicitfast"([^>]*?)/>', rf"\1\2{option}", text)
+    assert edits == 1
+    (tmp_path / "robot.xml").write_text(changed)
+    assert line in refusal(tmp_path / "robot.xml", backend)
+
+
+def test_a_plugin_that_warp_lacks_is_one_line(robot: Robot, tmp_path: Path) -> None:
+    """A touch grid is a sensor that native has; nobody reads it, and warp goes on without, or refuses it."""
+    plugin, settings = "mujoco.sensor.touch_grid", {"size": "3 3", "fov": "20 20", "gamma": "0", "nchannel": "1"}
+    configured = "".join(f'<config key="{key}" value="{value}"/>' for key, value in settings.items())
+    grid = f'<plugin name="grid" plugin="{plugin}" objtype="site" objname="right_foot">{configured}</plugin>'
+    text = robot.path.read_text().replace("<sensor>", f"<sensor>{grid}")
+    path = tmp_path / "grid.xml"
+    path.write_text(text.replace("<worldbody>", f'<extension><plugin plugin="{plugin}"/></extension><worldbody>', 1))
+    sim = make_simulator("native", load_robot(path), 2, DECIMATION, torch.device("cpu"), sensors=("grid",))
+    assert sim.step(torch.as_tensor(robot.nominal).float().repeat(2, 1), torch.zeros(2, 6)).sensors["grid"].shape == (2, 9)
+    make_simulator("warp", load_robot(path), 2, DECIMATION, torch.device("cpu"))
+    assert "backend 'warp': ['mjSENS_PLUGIN'] not supported." in refusal(path, "warp", ("grid",))
+
+
+def test_a_solver_that_warp_lacks_is_one_line(robot: Robot, tmp_path: Path) -> None:
+    text = robot.path.read_text()
+    (tmp_path / "robot.xml").write_text(text.replace("<option ", '<option solver="PGS" ', 1))
+    assert "backend 'warp': " in refusal(tmp_path / "robot.xml", "warp")
+
+
 def test_what_warp_cannot_do_is_one_line(robot: Robot) -> None:
     with pytest.raises(UserError, match=r"telebip\.xml: backend 'warp': Model field 'geom_contype' is not a batched .*$"):
         make_simulator("warp", robot, 2, DECIMATION, torch.device("cpu"), ("geom_contype",))
@@ -537,3 +574,11 @@ def test_what_warp_cannot_do_is_one_line(robot: Robot) -> None:
 
 def test_the_parts_of_the_state_are_mujoco_s(robot: Robot) -> None:
     assert state_fields(robot.model) == ("time", "qpos", "qvel", "qacc_warmstart", "qfrc_applied")
+
+
+def test_every_part_of_mujoco_s_state_is_a_field_of_its_data(monkeypatch: pytest.MonkeyPatch, robot: Robot) -> None:
+    """As if the robot had all of them; the names are MuJoCo's own, which may get more."""
+    monkeypatch.setattr("mujoco.mj_stateSize", lambda *_: 1)
+    fields = state_fields(robot.model)
+    assert {"act", "history", "plastic", "plugin_state", "userdata", "eq_active", "mocap_pos", "mocap_quat"} < set(fields)
+    assert all(hasattr(mujoco.MjData(robot.model), name) for name in fields)
