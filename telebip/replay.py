@@ -15,6 +15,7 @@ from telebip.errors import UserError
 from telebip.mdp.faults import KINDS
 from telebip.mdp.terminations import non_finite
 from telebip.robot import Robot, load_robot
+from telebip.robot_record import describe_robot, differences, is_record
 from telebip.rollout import Rollout
 from telebip.sim import Backend, SimState, Simulator, make_simulator
 
@@ -34,6 +35,7 @@ class Fault:
     backend: Backend
     model_fields: list[str]  # names of those that had a value per world
     record: dict[str, Tensor]  # of one world: `RECORD`, `Simulator.memory` and the fields of the model
+    robot: dict[str, Any]  # see `telebip.robot_record`
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,7 @@ class Replay:
     """The policy step of a fault again, one physics step at a time."""
 
     robot: Robot
+    robot_changes: list[str]  # in what that robot differs from the one that the fault happened to, a line each
     states: list[dict[str, Tensor]]  # `STATE` of one world: before the step, and after each of its physics steps
     targets: Tensor  # of each physics step (decimation, num_joints) [rad | m]
     force_w: Tensor  # on the trunk's centre of mass, world frame [N], (3,)
@@ -98,6 +101,7 @@ def save_fault(run_dir: Path, kind: str, record: dict[str, Tensor], task: str, e
         "backend": env.sim.backend,
         "model_fields": list(env.sim.model_fields),
         "memory": list(env.sim.memory),
+        "robot": describe_robot(env.robot, env.cfg.sim.decimation),
     }
     save_archive(file, {**about, "record": record})
     return file
@@ -112,19 +116,20 @@ def load_fault(path: str | Path) -> Fault:
     content = load_archive(Path(path), "fault", FORMAT)
     if content.get("kind") not in KINDS:
         raise UserError(f"fault '{path}': this version knows no '{content.get('kind')}'")
-    record, fields, memory = (content.get(name) for name in ("record", "model_fields", "memory"))
+    record, fields, memory, robot = (content.get(name) for name in ("record", "model_fields", "memory", "robot"))
     if (
         not isinstance(fields, list)
         or not isinstance(memory, list)
+        or not (isinstance(robot, dict) and is_record(robot))
         or content.get("backend") not in ("native", "warp")
         or not isinstance(content.get("config"), str)
     ):
-        raise UserError(f"fault '{path}' is not complete: it lacks its engine, its configuration or names")
+        raise UserError(f"fault '{path}' is not complete: it lacks its engine, its robot or its configuration")
     needed = {*RECORD, *fields, *memory}
     if not (isinstance(record, dict) and record.keys() >= needed and all(isinstance(x, Tensor) for x in record.values())):
         raise UserError(f"fault '{path}' is not complete: of the step's beginning it lacks something")
     config = parse_config(content["config"], f"{path}:config", missing=[])  # physics needs no terms
-    return Fault(content["kind"], config, content["backend"], fields, record)
+    return Fault(content["kind"], config, content["backend"], fields, record, robot)
 
 
 def replay(fault: Fault, backend: Backend | None = None) -> Replay:
@@ -147,7 +152,8 @@ def replay(fault: Fault, backend: Backend | None = None) -> Replay:
         seen |= {kind for kind, found in zip(KINDS[1:], rows.tolist(), strict=True) if found}
         states.append(_copy(sim.state))
         faults.append(set(seen))
-    return Replay(robot, states, targets, record["wrench_w"][:3], faults)
+    changes = differences(fault.robot, describe_robot(robot, cfg.sim.decimation))
+    return Replay(robot, changes, states, targets, record["wrench_w"][:3], faults)
 
 
 def _simulator_at(fault: Fault, robot: Robot, backend: Backend) -> Simulator:

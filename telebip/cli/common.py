@@ -15,9 +15,11 @@ from telebip.viz.opengl import check_opengl
 if TYPE_CHECKING:
     import torch
 
+    from telebip.config.schema import SimConfig
     from telebip.control.policy import Policy
     from telebip.env import TelebipEnv
     from telebip.rl.checkpoint import Checkpoint
+    from telebip.robot import Robot
 
 
 CONTROLLERS = ("alip", "dcm")
@@ -47,6 +49,11 @@ class Parser(argparse.ArgumentParser):
     def add_device(self) -> None:
         """Add `--device`."""
         self.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto, which prefers CUDA)")
+
+    def add_allow_robot_change(self) -> None:
+        """Add `--allow-robot-change`."""
+        text = "go on with another robot than that of the checkpoint: other gains, joints of other names, another rate"
+        self.add_argument("--allow-robot-change", action="store_true", help=text)
 
     def add_overrides(self, text: str = "override any field of the task") -> None:
         """Add the overrides, with `text` as their help."""
@@ -123,11 +130,36 @@ def open_policy(path: str | Path) -> "Checkpoint":
     return checkpoint
 
 
-def policy_of(checkpoint: "Checkpoint", env: "TelebipEnv") -> "Policy":
+def open_robot(checkpoint: "Checkpoint", sim: "SimConfig", allow_robot_change: bool) -> "Robot":
+    """Return the robot of a task, and print in what it differs from that of a checkpoint.
+
+    Raises:
+        UserError: there is none, or the checkpoint's policy cannot mean it; see `telebip.rl.policy.require_robot`.
+    """
+    from telebip.rl.policy import require_robot
+    from telebip.robot import load_robot
+
+    robot = load_robot(sim.robot)
+    compare_robot(checkpoint, sim, robot)
+    require_robot(checkpoint, sim, robot, allow_robot_change)
+    return robot
+
+
+def compare_robot(checkpoint: "Checkpoint", sim: "SimConfig", robot: "Robot") -> None:
+    """Print in what a robot differs from that of a checkpoint, a line each."""
+    from telebip.robot_record import describe_robot, differences, is_record
+
+    if not is_record(checkpoint.robot):
+        print(f"note: '{checkpoint.path}' says nothing of its robot but its joints and decimation")
+    for line in differences(checkpoint.robot_record, describe_robot(robot, sim.decimation)):
+        print(f"note: '{sim.robot}' is not the robot of '{checkpoint.path}': {line}")
+
+
+def policy_of(checkpoint: "Checkpoint", env: "TelebipEnv", allow_robot_change: bool = False) -> "Policy":
     """Return a checkpoint's policy, to walk in `env`; a `UserError` if it was trained on other joints or observations."""
     from telebip.rl.policy import load_policy, require_fit
 
-    require_fit(checkpoint, env)
+    require_fit(checkpoint, env, allow_robot_change=allow_robot_change)
     return load_policy(checkpoint, env.device)
 
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 
-from telebip.cli.common import CONTROLLERS, Parser, open_policy, policy_of, resolve_device
+from telebip.cli.common import CONTROLLERS, Parser, open_policy, open_robot, policy_of, resolve_device
 from telebip.config import load_task
 from telebip.errors import UserError
 
@@ -52,8 +52,10 @@ def main(argv: Sequence[str] | None = None) -> None:
         device=resolve_device(options.device),
         backend=options.backend,
     )
-    candidate_of = controller_candidate if options.controller else checkpoint_candidate
-    candidate = candidate_of(options.controller or options.checkpoint, options.label, options.overrides)
+    if options.controller:
+        candidate = controller_candidate(options.controller, options.label, options.overrides)
+    else:
+        candidate = checkpoint_candidate(options.checkpoint, options.label, options.overrides, options.allow_robot_change)
     candidate = replace(candidate, source=" ".join([candidate.source, *options.given]))
     out = Path(options.out) if options.out else default_folder(candidate.label)
     results = measure(console, candidate, suites, protocol, out)
@@ -100,33 +102,43 @@ def controller_candidate(name: str, label: str | None, overrides: Sequence[str] 
     from telebip.control.config import load_controller, split_overrides
     from telebip.control.factory import make_controller
     from telebip.eval.suites import Candidate
+    from telebip.robot import load_robot
+    from telebip.robot_record import describe_robot
 
     task, own = split_overrides(overrides)
     base = load_task("telebip_flat")
     config = load_task(base, task)
+    robot = describe_robot(load_robot(config.sim.robot), config.sim.decimation)
+    digest = (robot["digest"], robot["decimation"])
     return Candidate(
         label=label or name,
         config=base,
         make_policy=lambda env: make_controller(name, env, own),
         is_model_based=True,
         source=shlex.join(["evaluate.py", "--controller", name, *overrides]),
-        fingerprint=sha256(repr((name, load_controller(name, own), config.sim, config.actions)).encode()).hexdigest()[:16],
+        fingerprint=sha256(repr((name, load_controller(name, own), digest, config.actions)).encode()).hexdigest()[:16],
         overrides=tuple(task),
     )
 
 
-def checkpoint_candidate(checkpoint_path: str, label: str | None, overrides: Sequence[str] = ()):
+def checkpoint_candidate(
+    checkpoint_path: str, label: str | None, overrides: Sequence[str] = (), allow_robot_change: bool = False
+):
     """Return what a checkpoint holds for the evaluator; the label is the name of its task unless one is given."""
     from telebip.eval.suites import Candidate
+    from telebip.robot_record import describe_robot
 
     checkpoint = open_policy(checkpoint_path)
+    sim = load_task(checkpoint.config, overrides).sim
+    robot = describe_robot(open_robot(checkpoint, sim, allow_robot_change), sim.decimation)
+    what = checkpoint.path.read_bytes() + repr((robot["digest"], robot["decimation"])).encode()
     return Candidate(
         label=label or checkpoint.task,
         config=checkpoint.config,
-        make_policy=lambda env: policy_of(checkpoint, env),
+        make_policy=lambda env: policy_of(checkpoint, env, allow_robot_change),
         run_dir=checkpoint.path.parent,
         source=shlex.join(["evaluate.py", "--checkpoint", checkpoint_path, *overrides]),
-        fingerprint=sha256(checkpoint.path.read_bytes()).hexdigest()[:16],
+        fingerprint=sha256(what).hexdigest()[:16],
         overrides=tuple(overrides),
     )
 
@@ -194,6 +206,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--omni-worlds", type=int, default=16, metavar="N", help="worlds for each omni command (default: 16)")
     parser.add_argument("--terrain-worlds", type=int, default=64, metavar="N", help="worlds for each level (default: 64)")
     parser.add_engine()
+    parser.add_allow_robot_change()
     parser.add_overrides()
     options = parser.parse(argv)
     if not (options.checkpoint or options.controller):
@@ -213,5 +226,5 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
             *("push_worlds", "omni_worlds", "terrain_worlds", "backend"),
         )
         if (value := getattr(options, name)) != parser.get_default(name)
-    ]
+    ] + ["--allow-robot-change"] * options.allow_robot_change
     return options

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
-from telebip.cli.common import Parser, open_checkpoint
+from telebip.cli.common import Parser, open_checkpoint, open_robot
 from telebip.config import load_task
 from telebip.errors import UserError
 
@@ -24,6 +24,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         "--checkpoint", metavar="PATH_OR_RUN", required=True, help="a checkpoint, or a run folder for its newest"
     )
     parser.add_argument("--out", metavar="FILE.onnx", default="policy.onnx", help="file to write (default: policy.onnx)")
+    parser.add_allow_robot_change()
     parser.add_overrides("override any field of the task, as sim.robot")
     options = parser.parse(argv)
     for override in options.overrides:
@@ -39,7 +40,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     with console.status("loading torch"):
         from telebip.rl.export import export
     checkpoint = open_checkpoint(options.checkpoint)
-    checkpoint = dataclasses.replace(checkpoint, config=load_task(checkpoint.config, options.overrides))
+    config = load_task(checkpoint.config, options.overrides)
+    robot = open_robot(checkpoint, config.sim, options.allow_robot_change)
+    checkpoint = dataclasses.replace(checkpoint, config=config, joint_names=list(robot.joint_names))
     with console.status("exporting"):
         difference = export(checkpoint, out, SAMPLES)
     console.print(f"wrote {out}: the policy of {checkpoint.path}, after {checkpoint.iteration} iterations of {checkpoint.task}")

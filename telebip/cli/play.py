@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from telebip.cli.common import CONTROLLERS, Parser, check_connect, open_policy, policy_of, resolve_device
+from telebip.cli.common import CONTROLLERS, Parser, check_connect, open_policy, open_robot, policy_of, resolve_device
 from telebip.cli.evaluate import progress_bar, speed
 from telebip.config import TaskConfig, load_task
 from telebip.control.config import split_overrides
@@ -63,7 +63,8 @@ def _play(options: argparse.Namespace) -> None:
 
         require_viewer(options.connect)
     device = resolve_device(options.device)
-    robot = load_robot(config.sim.robot)
+    is_other = options.allow_robot_change
+    robot = open_robot(checkpoint, config.sim, is_other) if checkpoint else load_robot(config.sim.robot)
     if checkpoint:
         _warn_untrained(console, command, checkpoint.config)
     rollouts = []
@@ -71,7 +72,7 @@ def _play(options: argparse.Namespace) -> None:
         env = TelebipEnv(with_estimate(config) if name in CONTROLLERS else config, robot, device, options.backend)
         env.set_command(*command)
         own = options.control_overrides if name == options.controller else []
-        policy = policy_of(checkpoint, env) if checkpoint and name == "RL" else _policy(name, env, own)
+        policy = policy_of(checkpoint, env, is_other) if checkpoint and name == "RL" else _policy(name, env, own)
         if options.viewer == "mujoco":
             from telebip.viz.viewer import steer
 
@@ -97,6 +98,8 @@ def _replay(options: argparse.Namespace) -> None:
     backend = fault.backend if options.backend == "auto" else options.backend
     done = replay(fault, backend)
     console.print(f"{options.replay}: {fault.kind}, {describe(fault.record)}, on {fault.backend}; repeated on {backend}")
+    for line in done.robot_changes:
+        print(f"note: '{fault.config.sim.robot}' is not the robot of '{options.replay}': {line}")
     console.print(f"  {'physics step':>12}{'hip height [m]':>16}{'max |qvel|':>12}{'max force':>12}  faults")
     for step, (state, faults) in enumerate(zip(done.states, done.faults, strict=True)):
         row = f"{state['qpos'][0, 2]:16.4f}{state['qvel'].abs().max():12.4g}{state['joint_force'].abs().max():12.4g}"
@@ -209,6 +212,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--show", type=int, default=4, metavar="N", help="at most so many worlds, side by side (default: 4)")
     parser.add_argument("--seed", metavar="S", help="of the initial states (default: the task's)")
     parser.add_engine()
+    parser.add_allow_robot_change()
     parser.add_overrides("override any field of the task, or control.key of a --controller; of a --replay, sim.robot alone")
     options = parser.parse(argv)
     if not (options.checkpoint or options.controller or options.agent or options.replay):

@@ -51,7 +51,13 @@ def main(argv: Sequence[str] | None = None) -> None:
             name, label = training.name, training.label
             if seed > 1:
                 name, label = f"{name}-seed{seed}", f"{label}, seed {seed}"
-            _measure(console, out / name, training, options, checkpoint_candidate(str(run_dir), label))
+            _measure(
+                console,
+                out / name,
+                training,
+                options,
+                checkpoint_candidate(str(run_dir), label, (), options.allow_robot_change),
+            )
     for baseline in (baseline for baseline in BASELINES if baseline.name in only):
         candidate = controller_candidate(baseline.controller, baseline.label, baseline.overrides)
         _measure(console, out / baseline.name, baseline, options, candidate)
@@ -92,7 +98,7 @@ def _train(console, training, seed: int, options: argparse.Namespace) -> Path | 
         return run_dir
     make_folder(run_dir)
     console.print(f"{training.name}, seed {seed}: training in {run_dir}")
-    start = Start(training.task, config, run_dir=run_dir, checkpoint=checkpoint)
+    start = Start(training.task, config, run_dir, checkpoint=checkpoint, allow_robot_change=options.allow_robot_change)
     return run_dir if train(start, options.device) else None
 
 
@@ -135,6 +141,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--again", action="store_true", help="measure again what has been measured")
     parser.add_argument("--quick", action="store_true", help="toy size: two iterations, four worlds")
     parser.add_device()
+    parser.add_allow_robot_change()
     options = parser.parse(argv)
     options.out = options.out or ("runs/study_quick/results" if options.quick else "docs/results")
     options.runs = options.runs or ("runs/study_quick" if options.quick else "runs/study")

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from telebip.cli.common import Parser, check_connect, invocation, open_checkpoint, resolve_device
+from telebip.cli.common import Parser, check_connect, compare_robot, invocation, open_checkpoint, resolve_device
 from telebip.config import TaskConfig, load_task, task_names
 from telebip.errors import UserError
 from telebip.viz.opengl import choose_opengl
@@ -46,6 +46,7 @@ class Start:
     run_dir: Path | None = None  # the run's folder, which must exist; None makes a new one in `log_dir`
     log_dir: Path = Path("runs")
     checkpoint: "Checkpoint | None" = None  # where to go on from
+    allow_robot_change: bool = False  # whether on another robot
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,8 @@ def _resumed(options: argparse.Namespace) -> Start:
             f"--resume goes on with the checkpoint's generators, of seed {checkpoint.config.seed}; leave out the seed "
             f"{config.seed}, or start a new run with it"
         )
-    return Start(checkpoint.task, config, run_dir=checkpoint.path.resolve().parent, checkpoint=checkpoint)
+    run_dir = checkpoint.path.resolve().parent
+    return Start(checkpoint.task, config, run_dir, checkpoint=checkpoint, allow_robot_change=options.allow_robot_change)
 
 
 def _overrides(options: argparse.Namespace) -> list[str]:
@@ -139,7 +141,9 @@ def train(
             trainer = _make_trainer(start, ranks, str(device), backend, console)
         if ranks.is_main:  # after all that may be refused, so that this leaves no empty folder
             trainer.run_dir = stack.enter_context(_own_folder(start))
-        restart = trainer.resume(start.checkpoint) if start.checkpoint else ""
+        if start.checkpoint and ranks.is_main:
+            compare_robot(start.checkpoint, trainer.env.cfg.sim, trainer.env.robot)
+        restart = trainer.resume(start.checkpoint, start.allow_robot_change) if start.checkpoint else ""
         total = start.config.ppo.max_iterations
         if trainer.iteration >= total:
             console.print(f"{trainer.run_dir} has finished its {total} iterations; raise --max-iterations to train on")
@@ -294,9 +298,12 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--viewer", choices=("none", "rerun"), default="none", help="watch the training (default: none)")
     parser.add_argument("--connect", metavar="HOST:PORT", help="a running rerun viewer (default: start one here)")
+    parser.add_allow_robot_change()
     parser.add_overrides()
     options = parser.parse(argv)
     check_connect(options)
+    if options.allow_robot_change and not options.resume:
+        raise UserError("--allow-robot-change goes with --resume: a new run has no other robot")
     if options.resume and options.log_dir:
         raise UserError("--resume goes on in the run's own folder; leave out --log-dir")
     return options

@@ -15,7 +15,7 @@ from telebip.errors import UserError
 from telebip.files import is_file, is_folder
 from telebip.rl.layout import Image, Layout
 from telebip.rl.onnx import OnnxPolicy
-from telebip.robot import Robot
+from telebip.robot_record import is_record
 
 FORMAT = "telebip-checkpoint-2"
 POLICIES = ROOT / "assets" / "policies"
@@ -40,7 +40,7 @@ class Checkpoint:
     joint_mirror: Image | str  # how those joints are mirrored, or why they cannot be
     learner: dict[str, Any]  # state dictionaries as `rsl_rl.algorithms.PPO.save` returns them; none in an ONNX file
     training: list[dict[str, Any]]  # of each process: its worlds, generators and statistics; none where a policy is alone
-    robot: dict[str, list[float]]  # what `robot_properties` said of the robot trained on
+    robot: dict[str, Any]  # record of the robot trained on, see `telebip.robot_record`; checkpoints of before have none
     missing: tuple[str, ...] = ()  # terms of the task that this process does not know, as "rewards.level"
     damaged: tuple[str, ...] = ()  # newer checkpoints of the same folder that could not be read: why, a line each
     beside: tuple[int, ...] = ()  # iterations of all checkpoints that its folder had when it was loaded
@@ -49,6 +49,12 @@ class Checkpoint:
     def policy_weights(self) -> dict[str, Any]:
         """The actor's weights to walk with: their average over the latest iterations, where the training has one."""
         return self.learner.get("average_state_dict", self.learner["actor_state_dict"])
+
+    @property
+    def robot_record(self) -> dict[str, Any]:
+        """The record of the robot trained on, or no more of it than joints and decimation; see `telebip.robot_record`."""
+        known = self.robot if is_record(self.robot) else {"decimation": self.config.sim.decimation}
+        return {**known, "joint_names": self.joint_names}
 
     @property
     def is_onnx(self) -> bool:
@@ -158,19 +164,9 @@ def _load_onnx(file: Path) -> Checkpoint:
         joint_mirror="its mirror is inside of the ONNX file",
         learner={},
         training=[],
-        robot={},
+        robot=about.get("robot", {}),
         missing=tuple(missing),
     )
-
-
-def robot_properties(robot: Robot) -> dict[str, list[float]]:
-    """Return what tells robots apart: weight [N], nominal pose [rad | m], force limits [N m | N], physics step [s]."""
-    return {
-        "weight": [robot.weight],
-        "nominal pose": robot.nominal.tolist(),
-        "force limits": robot.force_limit.tolist(),
-        "physics step": [robot.physics_dt],
-    }
 
 
 def _find(given: Path) -> list[Path]:

@@ -25,6 +25,7 @@ from telebip.rl.policy import load_network
 from telebip.rl.run import git_revision
 from telebip.rl.symmetry import Canonical, SymmetricPolicy
 from telebip.robot import Robot, load_robot
+from telebip.robot_record import describe_robot
 
 TOLERANCE = 1e-5
 """Largest difference between the actions of ONNX and torch that an export may show [-]; see `largest_difference`."""
@@ -98,6 +99,7 @@ def describe(checkpoint: Checkpoint, robot: Robot) -> dict[str, Any]:
         "git_revision": git_revision(),
         "training_git_revision": _training_revision(checkpoint.path.parent),
         "config": to_yaml(config),
+        "robot": describe_robot(robot, config.sim.decimation),
     }
 
 

@@ -6,6 +6,7 @@ import torch
 from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 
+from telebip.config.schema import SimConfig
 from telebip.control.policy import Policy
 from telebip.env import TelebipEnv
 from telebip.errors import UserError
@@ -14,6 +15,8 @@ from telebip.rl.layout import described, obs_groups, width
 from telebip.rl.networks import actor_cfg
 from telebip.rl.onnx import OnnxPolicy
 from telebip.rl.symmetry import Canonical, SymmetricPolicy
+from telebip.robot import Robot
+from telebip.robot_record import describe_robot, differences, obstacles
 
 
 def load_policy(checkpoint: Checkpoint, device: str | torch.device) -> Policy:
@@ -48,18 +51,41 @@ def load_network(checkpoint: Checkpoint, device: str | torch.device = "cpu") -> 
     return policy.to(device).eval()
 
 
-def require_fit(checkpoint: Checkpoint, env: TelebipEnv, groups: Sequence[str] = ("policy",)) -> None:
+def require_robot(checkpoint: Checkpoint, sim: SimConfig, robot: Robot, allow_robot_change: bool = False) -> list[str]:
+    """Refuse a robot that the checkpoint's policy cannot mean: with other joints, or moved at another rate.
+
+    Args:
+        checkpoint: of the policy.
+        sim: names the robot, and says how many physics steps a policy step has.
+        robot: the robot.
+        allow_robot_change: whether it may be another one nevertheless, as long as it has as many joints.
+
+    Returns:
+        In what it differs from the robot trained on, a line each.
+
+    Raises:
+        UserError: it is such a robot.
+    """
+    theirs, own = checkpoint.robot_record, describe_robot(robot, sim.decimation)
+    reasons = obstacles(theirs, own)
+    fits = len(theirs["joint_names"]) == len(own["joint_names"])
+    if reasons and not (fits and allow_robot_change):
+        raise UserError(
+            f"checkpoint '{checkpoint.path}' was trained on another robot than '{sim.robot}': {'; '.join(reasons)}"
+            + "; go on with --allow-robot-change" * fits
+        )
+    return differences(theirs, own)
+
+
+def require_fit(
+    checkpoint: Checkpoint, env: TelebipEnv, groups: Sequence[str] = ("policy",), allow_robot_change: bool = False
+) -> None:
     """Refuse an environment in which the checkpoint's networks would see or move something else than they have learned with.
 
     Raises:
-        UserError: the joints differ, or what is in one of `groups`.
+        UserError: the robot is another one, see `require_robot`, or what is in one of `groups`.
     """
-    theirs, own = checkpoint.joint_names, list(env.robot.joint_names)
-    if theirs != own:
-        raise UserError(
-            f"checkpoint '{checkpoint.path}' was trained on another robot than '{env.cfg.sim.robot}': it moves the joints "
-            f"{', '.join(theirs)}, not {', '.join(own)}"
-        )
+    require_robot(checkpoint, env.cfg.sim, env.robot, allow_robot_change)
     for group in groups:
         seen, given = (
             described(layout, config, group)

@@ -5,9 +5,9 @@ from rsl_rl.algorithms import PPO
 from telebip.config.schema import PpoConfig
 from telebip.env import TelebipEnv
 from telebip.errors import UserError
-from telebip.rl.checkpoint import Checkpoint, robot_properties
+from telebip.rl.checkpoint import Checkpoint
 from telebip.rl.layout import seen
-from telebip.rl.policy import require_fit
+from telebip.rl.policy import require_fit, require_robot
 
 
 def require_complete(checkpoint: Checkpoint) -> None:
@@ -25,20 +25,26 @@ def require_complete(checkpoint: Checkpoint) -> None:
         )
 
 
-def require_same(checkpoint: Checkpoint, env: TelebipEnv) -> None:
+def require_same(checkpoint: Checkpoint, env: TelebipEnv, allow_robot_change: bool = False) -> list[str]:
     """Refuse a checkpoint whose networks saw something else than those of `env` will, or on another robot.
+
+    A run goes on bit for bit, so that any difference of the robot is refused, unless `allow_robot_change`.
+
+    Returns:
+        In what the robots differ, a line each.
 
     Raises:
         UserError: it is one.
     """
-    require_fit(checkpoint, env, list(seen(env.layout())))
-    own = robot_properties(env.robot)
-    for name, value in checkpoint.robot.items():
-        if own.get(name) != value:
-            raise UserError(
-                f"checkpoint '{checkpoint.path}' was trained on another robot than '{env.cfg.sim.robot}': its {name} is "
-                f"{value}, not {own.get(name)}"
-            )
+    found = require_robot(checkpoint, env.cfg.sim, env.robot, allow_robot_change)
+    if found and not allow_robot_change:
+        more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
+        raise UserError(
+            f"checkpoint '{checkpoint.path}' was trained on another robot than '{env.cfg.sim.robot}': {found[0]}{more}; go on "
+            "with --allow-robot-change"
+        )
+    require_fit(checkpoint, env, list(seen(env.layout())), allow_robot_change)
+    return found
 
 
 def load_learner(learner: PPO, checkpoint: Checkpoint, ppo: PpoConfig) -> None:

@@ -17,7 +17,7 @@ from torch import Tensor
 from telebip.env import TelebipEnv
 from telebip.errors import UserError
 from telebip.rl.averaging import Average
-from telebip.rl.checkpoint import Checkpoint, robot_properties
+from telebip.rl.checkpoint import Checkpoint
 from telebip.rl.distributed import Ranks
 from telebip.rl.faults import dump_new_faults, ruined_networks, too_many_faults
 from telebip.rl.layout import obs_groups, seen
@@ -28,6 +28,7 @@ from telebip.rl.process import random_state, set_random_state, threads_for
 from telebip.rl.resume import load_learner, require_complete, require_same
 from telebip.rl.saving import Saver
 from telebip.rl.symmetry import SymmetricEnv, joint_mirror
+from telebip.robot_record import describe_robot
 
 
 class Trainer:
@@ -59,6 +60,7 @@ class Trainer:
         self._average = Average(ppo.averaging, self.learner.get_policy().state_dict())
         self._saver = Saver(self.ranks, env.device, ppo.keep_checkpoints, note)
         self._episodes = EpisodeStatistics(env.num_envs, env.device)
+        self._robot = describe_robot(env.robot, env.cfg.sim.decimation)
         # Spread the time-outs over the iterations.
         ages = torch.randint(env.max_episode_length, (env.num_envs,), generator=env.generator, device=env.device)
         env.episode_length_buf.copy_(ages)
@@ -68,21 +70,24 @@ class Trainer:
         """What the networks compute in: bfloat16 or float32."""
         return arithmetic(self.env.cfg.ppo.mixed_precision, self.env.device)
 
-    def resume(self, checkpoint: Checkpoint) -> str:
+    def resume(self, checkpoint: Checkpoint, allow_robot_change: bool = False) -> str:
         """Go on from a checkpoint of the same task and robot, bit for bit as if nothing had happened in between.
 
         Returns:
-            Why the worlds start new episodes instead; empty if they do not. They do where the checkpoint has none, or others.
+            Why the worlds start new episodes instead; empty if they do not. They do where the checkpoint has none, or others,
+            or those of another robot, which is refused unless `allow_robot_change`.
 
         Raises:
             UserError: the checkpoint is of a policy alone, or of terms that are not there; or the networks, what they see or
                 the robot are not the checkpoint's.
         """
         require_complete(checkpoint)
-        require_same(checkpoint, self.env)
+        robot_changes = require_same(checkpoint, self.env, allow_robot_change)
         load_learner(self.learner, checkpoint, self.env.cfg.ppo)
         self._average.load(checkpoint.policy_weights)
         self.iteration, self.samples = checkpoint.iteration, checkpoint.samples
+        if robot_changes:
+            return "the checkpoint's worlds are of another robot"
         if len(checkpoint.training) != self.ranks.size:
             return f"the checkpoint has worlds of {len(checkpoint.training)} processes, this run has {self.ranks.size}"
         state = checkpoint.training[self.ranks.rank]
@@ -221,5 +226,5 @@ class Trainer:
             joint_mirror=joint_mirror(env.robot),
             learner=learner,
             training=training,
-            robot=robot_properties(env.robot),
+            robot=self._robot,
         )

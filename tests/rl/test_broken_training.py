@@ -127,9 +127,14 @@ def test_networks_ruined_before_the_first_checkpoint_have_none_to_go_on_from(rob
 def test_another_robot_is_named(robot: Robot, tmp_path: Path) -> None:
     Training(robot, tmp_path, "ppo.max_iterations=1").learn()
     checkpoint = load_checkpoint(tmp_path)
-    checkpoint.robot["weight"] = [99.0]
-    with pytest.raises(UserError, match=r"was trained on another robot than 'assets/telebip.xml': its weight is \[99.0\]"):
-        Training(robot, tmp_path, "ppo.max_iterations=2").trainer.resume(checkpoint)
+    checkpoint.robot["values"]["mass [kg]"]["trunk"] = [99.0]
+    other = Training(robot, tmp_path, "ppo.max_iterations=2").trainer
+    with pytest.raises(
+        UserError, match=r"was trained on another robot than 'assets/telebip.xml': mass \[kg\]: trunk 99 -> 10; go"
+    ):
+        other.resume(checkpoint)
+    assert "of another robot" in other.resume(checkpoint, allow_robot_change=True)
+    assert other.iteration == 1
 
 
 @pytest.mark.parametrize(
