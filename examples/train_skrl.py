@@ -65,7 +65,9 @@ class Critic(DeterministicMixin, Model):
 def train(num_envs: int, iterations: int, seed: int = 0) -> RecordEpisodeStatistics:
     """Train a policy from scratch and return the worlds, with the statistics of the last episodes."""
     set_seed(seed)
-    statistics = RecordEpisodeStatistics(gymnasium.make_vec("telebip/Flat-v0", num_envs=num_envs), buffer_length=200)
+    statistics = RecordEpisodeStatistics(
+        gymnasium.make_vec("telebip/Flat-v0", num_envs=num_envs, autoreset_mode="SameStep"), buffer_length=200
+    )
     env = wrap_env(statistics, wrapper="gymnasium")
     spaces: dict[str, Any] = {
         "observation_space": env.observation_space,

@@ -156,11 +156,16 @@ class TelebipEnv(VecEnv):
         types = self.world.ground.types if self.world.ground else ()
         self.log_names = log.names(self.reward_names, tuple(self._terminations), types)
 
-    def reset(self) -> TensorDict:
-        """Start a new episode in every world and return its observation."""
+    def reset(self, mask: Tensor | None = None) -> TensorDict:
+        """Start a new episode where `mask` (num_envs,) holds, in every world if not given, and return all observations.
+
+        The other worlds never notice.
+        """
+        mask, before = self._everywhere() if mask is None else mask, self.state.random.clone()
         self._random.draw(self.generator)
-        self._reset(self._everywhere())
-        self.sim.refresh_constants(self._everywhere())
+        self.state.random.copy_(torch.where(mask[:, None], self.state.random, before))
+        self._reset(mask)
+        self.sim.refresh_constants(mask)
         return self.get_observations()
 
     def set_command(self, lin_vel_x: float, lin_vel_y: float, ang_vel_z: float) -> None:

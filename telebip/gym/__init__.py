@@ -7,6 +7,9 @@ the arguments of `telebip.gym.env.TelebipVectorEnv`: `make_vec("telebip/Flat-v0"
 import gymnasium
 
 from telebip.config import task_names
+from telebip.viz.opengl import choose_opengl
+
+choose_opengl()  # before MuJoCo is imported, for `render_mode="rgb_array"`
 
 
 def env_id(task: str) -> str:

@@ -47,6 +47,10 @@ class Renderer:
         return self
 
     def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Free the OpenGL context."""
         self._renderer.close()
 
     def look_at(self, point: Sequence[float], distance: float, azimuth: float, elevation: float) -> None:

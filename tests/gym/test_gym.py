@@ -1,15 +1,19 @@
 """Gymnasium's contract: spaces that hold, episodes that end as declared, its own checker and wrappers, and the same physics."""
 
+import os
 from dataclasses import replace
+from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.wrappers.vector import (
     ClipAction,
+    NormalizeObservation,
     NormalizeReward,
     RecordEpisodeStatistics,
     RescaleAction,
@@ -17,6 +21,7 @@ from gymnasium.wrappers.vector import (
 from worlds import CALM
 
 import telebip.gym
+from telebip import ROOT
 from telebip.config import load_task, task_names
 from telebip.config.schema import ObservationGroup
 from telebip.errors import UserError
@@ -26,8 +31,8 @@ from telebip.robot import Robot
 SHORT = "episode.length=0.2"  # ten policy steps
 
 
-def make(*overrides: str, num_envs: int = 4, name: str = "telebip/Flat-v0") -> VectorEnv:
-    return gymnasium.make_vec(name, num_envs=num_envs, overrides=overrides)
+def make(*overrides: str, num_envs: int = 4, name: str = "telebip/Flat-v0", mode: str = "SameStep", **more) -> VectorEnv:
+    return gymnasium.make_vec(name, num_envs=num_envs, overrides=overrides, autoreset_mode=mode, **more)
 
 
 def actions(steps: int, num_envs: int = 4, scale: float = 0.3) -> np.ndarray:
@@ -136,7 +141,6 @@ def test_returned_arrays_are_the_callers() -> None:
 
 
 def test_a_time_out_truncates_and_its_final_observation_is_that_of_the_unbroken_episode() -> None:
-    assert TelebipVectorEnv.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
     short, long = make(SHORT, *CALM), make(*CALM)
     start, _ = short.reset(seed=1)
     np.testing.assert_array_equal(long.reset(seed=1)[0], start)
@@ -184,7 +188,7 @@ def test_keeping_final_observations_changes_nothing_else(make_env) -> None:
 
 
 def test_gymnasiums_checker_finds_nothing(recwarn: pytest.WarningsRecorder) -> None:
-    check_env(gymnasium.make("telebip/Flat-v0").unwrapped, skip_render_check=True)
+    check_env(gymnasium.make("telebip/Flat-v0", render_mode="rgb_array").unwrapped, skip_render_check=not has_opengl())
     advice = ("infinity", "symmetric and normalized")  # velocities have no bounds; RescaleAction normalises actions
     assert [w for w in recwarn if not any(part in str(w.message) for part in advice)] == []
 
@@ -196,10 +200,149 @@ def test_one_world_waits_at_the_end_of_its_episode() -> None:
         obs, _, terminated, truncated, _ = env.step(action)
         assert (terminated, truncated) == (False, step == 9)
     np.testing.assert_array_equal(obs[12:18], action)
+    with pytest.raises(ResetNeeded):
+        env.unwrapped.step(action)
+    env.reset()
+    env.step(action)
+
+
+def has_opengl() -> bool:
+    return os.environ.get("MUJOCO_GL") != "disable"
+
+
+def test_the_next_step_starts_the_next_episode() -> None:
+    """By default: the last observation is the step's own, and the action of the step after it is nobody's."""
+    env, same = gymnasium.make_vec("telebip/Flat-v0", num_envs=4, overrides=(SHORT, *CALM)), make(SHORT, *CALM)
+    assert env.metadata["autoreset_mode"] == AutoresetMode.NEXT_STEP
+    np.testing.assert_array_equal(env.reset(seed=1)[0], same.reset(seed=1)[0])
+    for step, action in enumerate(actions(10)):
+        obs, rewards, terminated, truncated, infos = env.step(action)
+        expected, expected_rewards, *_, other = same.step(action)
+        np.testing.assert_array_equal(rewards, expected_rewards)
+        np.testing.assert_array_equal(obs, np.stack(other["final_obs"]) if step == 9 else expected)
+        assert infos == {}
+        assert truncated.all() == (step == 9)
+    obs, rewards, terminated, truncated, _ = env.step(actions(1)[0])
+    assert not (terminated.any() or truncated.any() or rewards.any())
+    np.testing.assert_array_equal(obs[:, 12:18], 0.0)  # a first observation has no last action
+    np.testing.assert_allclose(obs[:, 31:], 0.0, atol=1e-6)  # and the clock stands at zero
+    for step, action in enumerate(actions(10)):
+        assert env.step(action)[3].all() == (step == 9)  # an episode is as long as the first
+
+
+def test_a_fall_ends_one_world_and_the_others_never_notice() -> None:
+    env, plain = make(*CALM, mode="NextStep"), make(*CALM, mode="NextStep")
+    for one in (env, plain):
+        one.reset(seed=0)
+    worlds = env.unwrapped.worlds  # type: ignore[attr-defined]
+    qpos = worlds.sim.state.qpos.clone()
+    qpos[1, 2] = 0.3  # m: hips below the 0.4 m of a fall
+    worlds.sim.reset(torch.tensor([False, True, False, False]), qpos, 0.0 * worlds.sim.state.qvel)
+    ends, others = [], [0, 2, 3]
+    for action in actions(3):
+        obs, rewards, terminated, *_ = env.step(action)
+        expected, expected_rewards, *_ = plain.step(action)
+        np.testing.assert_array_equal(obs[others], expected[others])
+        np.testing.assert_array_equal(rewards[others], expected_rewards[others])
+        ends.append(terminated.tolist())
+    assert ends == [[False, True, False, False], [False] * 4, [False] * 4]
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
+def test_a_mask_resets_its_worlds_alone(mode: str) -> None:
+    env, plain = make(mode=mode), make(mode=mode)
+    mask = np.array([False, True, False, True])
+    for one in (env, plain):
+        one.reset(seed=0)
+        before = [one.step(action)[0] for action in actions(5)][-1]
+    obs, _ = env.reset(options={"reset_mask": mask})
+    np.testing.assert_array_equal(obs[~mask], before[~mask])
+    np.testing.assert_array_equal(obs[mask, 12:18], 0.0)
+    assert np.abs(obs[~mask, 12:18]).min() > 0.0
+    assert env.unwrapped.worlds.episode_length_buf.tolist() == [5, 0, 5, 0]  # type: ignore[attr-defined]
+    state, untouched = (one.unwrapped.worlds.sim.state.qpos[~mask] for one in (env, plain))  # type: ignore[attr-defined]
+    assert torch.equal(state, untouched)
+    env.step(actions(1)[0])
+
+
+def test_without_automatic_resets_an_episode_waits() -> None:
+    env = make(SHORT, *CALM, mode="Disabled")
+    env.reset(seed=0)
+    for action in actions(10):
+        truncated = env.step(action)[3]
+    with pytest.raises(ResetNeeded, match=r"the episodes of worlds \[0, 1, 2, 3\] are over"):
+        env.step(action)
+    env.reset(options={"reset_mask": truncated})
+    env.step(action)
+
+
+@pytest.mark.parametrize(
+    ("options", "error"),
+    [
+        ({"reset_mask": [True] * 4}, TypeError),
+        ({"reset_mask": np.ones(4)}, TypeError),
+        ({"reset_mask": np.ones(3, dtype=bool)}, ValueError),
+        ({"reset_mask": np.zeros(4, dtype=bool)}, ValueError),
+        ({"mask": np.ones(4, dtype=bool)}, ValueError),
+    ],
+)
+def test_a_wrong_mask_is_named(options: dict, error: type[Exception]) -> None:
+    with pytest.raises(error, match="mask"):
+        make().reset(options=options)
+
+
+def test_wrong_modes_are_one_line() -> None:
+    with pytest.raises(UserError, match=r"^unknown autoreset_mode 'NextStap'; did you mean 'NextStep'\?$"):
+        make(mode="NextStap")
+    with pytest.raises(UserError, match=r"^unknown render_mode 'human'; valid: rgb_array, or None$"):
+        make(render_mode="human")
+
+
+@pytest.mark.skipif(not has_opengl(), reason="no OpenGL")
+def test_pictures_are_of_each_world() -> None:
+    env = make(num_envs=2, render_mode="rgb_array")
+    env.reset(seed=0)
+    pictures = env.render()
+    assert pictures is not None
+    assert [(picture.shape, picture.dtype) for picture in pictures] == [((360, 480, 3), np.uint8)] * 2  # type: ignore[union-attr]
+    assert all(np.std(picture) > 10.0 for picture in pictures)  # type: ignore[arg-type]
+    env.close()
+    one = gymnasium.make("telebip/Flat-v0", render_mode="rgb_array")
+    one.reset(seed=0)
+    assert one.render().shape == (360, 480, 3)  # type: ignore[union-attr]
+    one.close()
+    assert make(num_envs=1).render() is None
+
+
+def test_a_checkpoints_robot_is_compared(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
+    text = (ROOT / "assets" / "telebip.xml").read_text()
+    (tmp_path / "soft.xml").write_text(text.replace('kp="200"', 'kp="100"'))
+    (tmp_path / "fast.xml").write_text(text.replace('timestep="0.005"', 'timestep="0.001"'))
+    make(checkpoint="telebip_flat")
+    assert not [w for w in recwarn if "is not the robot of" in str(w.message)]
+    make(f"sim.robot={tmp_path / 'soft.xml'}", checkpoint="telebip_flat")
+    assert len([w for w in recwarn if "stiffness kp [N m/rad | N/m]: right_hip_roll 200 -> 100" in str(w.message)]) == 1
+    with pytest.raises(UserError, match=r"its policy step is 0\.02 s, not 0\.004 s"):
+        make(f"sim.robot={tmp_path / 'fast.xml'}", checkpoint="telebip_flat")
+    make(f"sim.robot={tmp_path / 'fast.xml'}", checkpoint="telebip_flat", allow_robot_change=True)
+
+
+def test_wrappers_of_observations_apply() -> None:
+    env = NormalizeObservation(gymnasium.make_vec("telebip/Flat-v0", num_envs=4, overrides=(SHORT,)))
+    obs, _ = env.reset(seed=0)
+    for action in actions(25):
+        obs, *_ = env.step(action)
+    assert np.isfinite(obs).all()
+    assert env.obs_rms.count > 100
+    statistics = RecordEpisodeStatistics(make(SHORT, *CALM, mode="NextStep"))
+    statistics.reset(seed=0)
+    for action in actions(22):
+        statistics.step(action)
+    assert list(statistics.length_queue) == [10] * 8
 
 
 def test_gymnasiums_wrappers_apply() -> None:
-    """Those that know of same-step resets, that is: the wrappers of observations refuse them."""
+    """Those that know of same-step resets."""
     env = RecordEpisodeStatistics(make(SHORT, *CALM))
     env.reset(seed=0)
     for action in actions(21):
