@@ -84,8 +84,8 @@ SHOWN = 3  # parts of a difference that are named
 
 
 def describe_robot(robot: Robot, decimation: int) -> dict[str, Any]:
-    """Return the record of a robot whose policy step has `decimation` physics steps."""
-    model = robot.engine_model()
+    """Return the record of a robot whose policy step has `decimation` physics steps; the terrain is no part of it."""
+    model = robot.on(None).engine_model()
     values = {quantity.name: _values(model, quantity, robot.joint_names) for quantity in QUANTITIES}
     whole = {name: {"": _numbers(attrgetter(field)(model))} for name, field in OPTIONS.items()}
     home = {"home position [rad | m]": dict(zip(robot.joint_names, map(_numbers, robot.nominal), strict=True))}
