@@ -120,7 +120,7 @@ class TelebipEnv(VecEnv):
             gait_period=cfg.gait.period,
             home_qpos=constant(robot.home_qpos),
             nominal=constant(robot.nominal),
-            force_limit=constant(robot.force_limit),
+            force_range=constant(robot.force_range),
             action_scale=constant(scales(cfg.actions.scale, robot.joint_names)),
             foot_lift=constant(robot.foot_lift),
             ground=Ground(robot.terrain, self.device) if robot.terrain else None,

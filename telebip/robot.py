@@ -14,18 +14,16 @@ from numpy.typing import NDArray
 from telebip import ROOT
 from telebip.errors import UserError, nearest
 from telebip.files import is_file
+from telebip.robot_check import HINGE, SLIDE, Parts, check_model, in_joint_units
 from telebip.terrain import Terrain
 
 FEET = ("right_foot", "left_foot")
 """The order of all that is told of two feet: right first, as the phase signals (p_r, p_l)."""
 FOOT_SENSORS = tuple(f"{foot}_force" for foot in FEET)
-TRUNK, FLOOR, KEYFRAME = "trunk", "floor", "home"
+FLOOR, KEYFRAME = "floor", "home"
 NET_FORCE = 3
 """MuJoCo's number of a contact sensor's `reduce="netforce"`."""
 
-HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
-DYNAMICS = [int(kind) for kind in (mujoco.mjtDyn.mjDYN_NONE, mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT)]
-"""Of an actuator whose control is where the joint is to go: at once, or through a first-order filter."""
 MIRROR = np.array([1.0, -1.0, 1.0])
 """Reflection of a polar vector at the plane y = 0; an axial one is reflected by its negative."""
 
@@ -40,7 +38,10 @@ class JointMirror:
 
 @dataclass(frozen=True)
 class Robot:
-    """A compiled model and what the MDP reads from it. Joints in the order of `joint_names`, feet in that of `FEET`."""
+    """A compiled model and what the MDP reads from it. Joints in the order of `joint_names`, feet in that of `FEET`.
+
+    Models are as `telebip.robot_check.in_joint_units` leaves them: controls are joint targets, forces the joints'.
+    """
 
     path: Path
     model: mujoco.MjModel  # everything that the file describes
@@ -48,7 +49,7 @@ class Robot:
     home_qpos: NDArray[np.float64]  # (nq,) standing on the ground, heading along x
     nominal: NDArray[np.float64]  # (num_joints,) joint positions of the home pose [rad | m]
     joint_range: NDArray[np.float64]  # (num_joints, 2) [rad | m]
-    force_limit: NDArray[np.float64]  # (num_joints,) largest actuator forces [N m | N]
+    force_range: NDArray[np.float64]  # (num_joints, 2) least and largest actuator forces, of either sign [N m | N]
     is_slide: NDArray[np.bool_]  # (num_joints,) whether a joint is prismatic: m and N instead of rad and N m
     weight: float  # m g [N]
     trunk_id: int  # of `model`, as `floor_id`; an engine's model may number its parts otherwise
@@ -59,6 +60,16 @@ class Robot:
     terrain: Terrain | None = None  # on which it stands; None: the floor of the file
 
     @property
+    def trunk_name(self) -> str:
+        """Name of the body with the free joint."""
+        return self.model.body(self.trunk_id).name
+
+    @property
+    def force_limit(self) -> NDArray[np.float64]:
+        """Largest magnitudes of the actuators' forces [N m | N], (num_joints,)."""
+        return np.abs(self.force_range).max(1)
+
+    @property
     def physics_dt(self) -> float:
         """Physics step [s]."""
         return float(self.model.opt.timestep)
@@ -67,10 +78,10 @@ class Robot:
         """Return the same robot on a height field with its floor's friction and look, or on the floor of its file."""
         if terrain is self.terrain:
             return self
-        spec = mujoco.MjSpec.from_file(str(self.path))
+        spec = _read(self.path, self.path)
         if terrain:
             _lay(spec, terrain)
-        return replace(self, model=spec.compile(), terrain=terrain)
+        return replace(self, model=_compiled(spec, self.path), terrain=terrain)
 
     def engine_model(self, sensors: Sequence[str] = ()) -> mujoco.MjModel:
         """Compile the file, on its `terrain`, as an engine steps it: with `ground_force_sensor` of each foot.
@@ -86,7 +97,7 @@ class Robot:
         Raises:
             UserError: there is no such sensor, or without the rest the file is no valid MJCF.
         """
-        spec = mujoco.MjSpec.from_file(str(self.path))
+        spec = _read(self.path, self.path)
         kept = [sensor for sensor in spec.sensors if sensor.name in sensors]
         for name in sensors:
             if name not in [sensor.name for sensor in kept]:
@@ -103,10 +114,7 @@ class Robot:
         spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
         if self.terrain:
             _lay(spec, self.terrain)
-        try:
-            return spec.compile()
-        except ValueError as error:
-            raise UserError(f"{self.path}: {error}") from error
+        return _compiled(spec, self.path)
 
 
 def _lay(spec: mujoco.MjSpec, terrain: Terrain) -> None:
@@ -143,27 +151,25 @@ def ground_force_sensor(foot: str) -> str:
 def load_robot(path: str | Path) -> Robot:
     """Load a biped; relative paths start at telebip's own folder, then at the working directory.
 
-    The MJCF must name the body `trunk` with a free joint, which comes first, a touch sensor `<foot>_force` for each of `FEET`,
-    the geom `floor`, and the keyframe `home`. All other joints are hinges and slides. Every actuator is a position actuator
-    with a force range, on a named joint with a range, at once or through a filter; a joint may have none. See
-    docs/your_robot.md.
+    The MJCF must have a free joint, which comes first and whose body is the trunk, a touch sensor `<foot>_force` for each of
+    `FEET`, the geom `floor`, and the keyframe `home`. All other joints are hinges and slides. Every actuator is a position
+    actuator with a force range, on a named joint with a range; a joint may have none. See docs/your_robot.md.
 
     Raises:
         UserError: the file is missing or is no valid MJCF, or something is missing or of another kind; the message says what.
     """
     file = next((p for p in (ROOT / path, Path(path)) if is_file(p)), None)
     if file is None:
-        raise UserError(f"robot file '{path}' does not exist")
-    try:
-        model = mujoco.MjModel.from_xml_path(str(file))
-    except ValueError as error:
-        raise UserError(f"{path}: {error}") from error
-    trunk = part(model, "body", TRUNK, path).id
-    floor = part(model, "geom", FLOOR, path).id
+        raise UserError(f"robot file '{path}' does not exist; if it has moved, say where it is: sim.robot=FILE")
+    model = _compiled(_read(file, path), path)
+    if model.njnt == 0 or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
+        raise UserError(f"{path}: the first joint must be a free joint, that of the trunk")
+    trunk, floor = int(model.jnt_bodyid[0]), part(model, "geom", FLOOR, path).id
     sensors = [part(model, "sensor", name, path).id for name in FOOT_SENSORS]
-    home = part(model, "key", KEYFRAME, path).qpos.copy()
-    _check_bodies(model, trunk, sensors, path)
-    _check_actuators(model, path)
+    key = part(model, "key", KEYFRAME, path).id
+    check_model(model, path, Parts(trunk, floor, sensors, key))
+    home = model.key_qpos[key].copy()
+    home[3:7] /= np.linalg.norm(home[3:7])
     joints = model.actuator_trnid[:, 0]
     columns = model.jnt_qposadr[joints]
     return Robot(
@@ -173,7 +179,7 @@ def load_robot(path: str | Path) -> Robot:
         home_qpos=home,
         nominal=home[columns],
         joint_range=model.jnt_range[joints],
-        force_limit=np.abs(model.actuator_forcerange).max(1),
+        force_range=model.actuator_forcerange.copy(),
         is_slide=model.jnt_type[joints] == SLIDE,
         weight=float(model.body_subtreemass[trunk] * np.linalg.norm(model.opt.gravity)),
         trunk_id=trunk,
@@ -184,51 +190,22 @@ def load_robot(path: str | Path) -> Robot:
     )
 
 
-def _check_bodies(model: mujoco.MjModel, trunk: int, sensors: list[int], path: str | Path) -> None:
-    """Raise a `UserError` unless trunk, feet and joints are of the kinds that the MDP takes for granted."""
-    if model.njnt == 0 or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE or model.jnt_bodyid[0] != trunk:
-        raise UserError(f"{path}: the first joint must be a free joint, that of body '{TRUNK}'")
-    for joint in range(1, model.njnt):
-        if model.jnt_type[joint] not in (HINGE, SLIDE):
-            raise UserError(f"{path}: joint '{model.joint(joint).name}' must be a hinge or a slide")
-    for sensor in sensors:
-        if model.sensor_type[sensor] != mujoco.mjtSensor.mjSENS_TOUCH:
-            raise UserError(f"{path}: sensor '{model.sensor(sensor).name}' must be a touch sensor")
+def _read(file: Path, path: str | Path) -> mujoco.MjSpec:
+    """Parse an MJCF; errors name it as `path`."""
+    try:
+        return mujoco.MjSpec.from_file(str(file))
+    except (ValueError, OSError, mujoco.FatalError) as error:
+        raise UserError(f"{path}: {error}") from error
 
 
-def _check_actuators(model: mujoco.MjModel, path: str | Path) -> None:
-    """Raise a `UserError` unless every actuator's control is the target of one joint of its own."""
-    if model.nu == 0:
-        raise UserError(f"{path}: expected position actuators, one for each joint that a policy moves")
-    driven: set[str] = set()
-    for i in range(model.nactuator):
-        name = model.actuator(i).name or str(i)
-        on_joint = model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
-        if not on_joint or model.jnt_type[model.actuator_trnid[i, 0]] not in (HINGE, SLIDE):
-            raise UserError(f"{path}: actuator '{name}' must drive one joint, a hinge or a slide")
-        joint = model.joint(model.actuator_trnid[i, 0])
-        for holds, else_wrong in (
-            (joint.name, f"the joint of actuator '{name}' needs a name"),
-            (joint.name not in driven, f"joint '{joint.name}' has a second actuator, '{name}'"),
-            (model.jnt_limited[joint.id], f"joint '{joint.name}' needs a range"),
-            (_is_position(model, i), f"actuator '{name}' must be a position actuator: its control is a joint target"),
-            (
-                model.actuator_dyntype[i] in DYNAMICS,
-                f"actuator '{name}' must act at once or through a filter (timeconst), not through other activation dynamics",
-            ),
-            (model.actuator_gear[i, 0] == 1.0, f"actuator '{name}' must have a gear of 1"),
-            (model.actuator_forcelimited[i], f"actuator '{name}' needs a forcerange"),
-        ):
-            if not holds:
-                raise UserError(f"{path}: {else_wrong}")
-        driven.add(joint.name)
-
-
-def _is_position(model: mujoco.MjModel, i: int) -> bool:
-    """Whether an actuator's force is kp (control - position) and what depends on its velocity."""
-    kinds = (model.actuator_gaintype[i], model.actuator_biastype[i])
-    is_linear = kinds == (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_AFFINE)
-    return is_linear and 0 < model.actuator_gainprm[i, 0] == -model.actuator_biasprm[i, 1]
+def _compiled(spec: mujoco.MjSpec, path: str | Path) -> mujoco.MjModel:
+    """Compile an MJCF, with its actuators in the units of their joints."""
+    try:
+        model = spec.compile()
+    except (ValueError, mujoco.FatalError) as error:
+        raise UserError(f"{path}: {error}") from error
+    in_joint_units(model)
+    return model
 
 
 def part(model: mujoco.MjModel, kind: str, name: str, path: str | Path, condition: str = "") -> Any:
@@ -279,7 +256,7 @@ def _mirror(model: mujoco.MjModel, trunk: int, home: NDArray[np.float64], sites:
     mujoco.mj_kinematics(model, data)
 
     if not _same(data.qpos[3:7], data.qpos[3:7] * [1.0, -1.0, 1.0, -1.0]):
-        return f"body '{TRUNK}' leans to one side"
+        return f"body '{model.body(trunk).name}' leans to one side"
     if not _same(data.site_xpos[sites[0]], data.site_xpos[sites[1]] * MIRROR):
         return "places of the feet's touch sensors"
     names = [model.joint(joint).name for joint in range(model.njnt)]
@@ -308,7 +285,7 @@ def _mirror(model: mujoco.MjModel, trunk: int, home: NDArray[np.float64], sites:
                 return f"gains of {pair}"
             order[a], sign[a] = b, signed
     if not _mirrors(moments[trunk], moments[trunk]):
-        return f"masses of body '{TRUNK}'"
+        return f"masses of body '{model.body(trunk).name}'"
     return JointMirror(order, sign)
 
 

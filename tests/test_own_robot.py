@@ -15,7 +15,7 @@ from telebip.cli import evaluate, export, play, train
 from telebip.config import load_task
 from telebip.env import TelebipEnv
 from telebip.rl.checkpoint import load_checkpoint
-from telebip.robot import FLOOR, FOOT_SENSORS, KEYFRAME, TRUNK, load_robot
+from telebip.robot import FLOOR, FOOT_SENSORS, KEYFRAME, load_robot
 
 FOLDER = ROOT / "tests" / "robots"
 TASK = FOLDER / "rotary_knee.yaml"
@@ -139,7 +139,7 @@ def test_both_engines_take_it() -> None:
 
 def test_the_tutorial_names_what_the_loader_demands() -> None:
     text = (ROOT / "docs" / "your_robot.md").read_text(encoding="utf-8")
-    for name in (TRUNK, FLOOR, KEYFRAME, *FOOT_SENSORS):
+    for name in (FLOOR, KEYFRAME, *FOOT_SENSORS):
         assert f"`{name}`" in text
     task = (FOLDER / "rotary_knee.yaml").read_text(encoding="utf-8")
     shown = re.search(r"```yaml\n(.*?)```", text, re.DOTALL)

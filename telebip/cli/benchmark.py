@@ -5,7 +5,7 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from telebip.cli.common import Parser, check_outputs, open_checkpoint, resolve_device
+from telebip.cli.common import Parser, check_outputs, checked_robot, open_checkpoint, resolve_device
 from telebip.config import task_names
 from telebip.errors import UserError
 
@@ -29,7 +29,6 @@ def main(argv: Sequence[str] | None = None) -> None:
         from telebip.cli.evaluate import progress_bar
         from telebip.rl.process import keep_freed_memory
         from telebip.rl.run import describe_code
-        from telebip.robot import load_robot
         from telebip.tools.benchmark import configurations, measure, shipped_for, table
         from telebip.tools.measuring import machine_name
 
@@ -40,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     device = resolve_device(options.device)
     if device.type == "cpu":
         keep_freed_memory()
-    robot, machine, threads = load_robot(configs[0].sim.robot), machine_name(device), torch.get_num_threads()
+    robot, machine, threads = checked_robot(configs[0]), machine_name(device), torch.get_num_threads()
 
     rows, done, total = [], 0, (options.rounds + 1) * sum(options.num_envs)
     with progress_bar(console) as show:

@@ -15,9 +15,11 @@ from telebip.viz.opengl import check_opengl
 if TYPE_CHECKING:
     import torch
 
+    from telebip.config import TaskConfig
     from telebip.config.schema import SimConfig
     from telebip.control.policy import Policy
     from telebip.env import TelebipEnv
+    from telebip.eval.standing import Finding
     from telebip.rl.checkpoint import Checkpoint
     from telebip.robot import Robot
 
@@ -130,19 +132,16 @@ def open_policy(path: str | Path) -> "Checkpoint":
     return checkpoint
 
 
-def open_robot(checkpoint: "Checkpoint", sim: "SimConfig", allow_robot_change: bool) -> "Robot":
-    """Return the robot of a task, and print in what it differs from that of a checkpoint.
+def match_robot(checkpoint: "Checkpoint", sim: "SimConfig", robot: "Robot", allow_robot_change: bool) -> None:
+    """Print in what a robot differs from that of a checkpoint.
 
     Raises:
-        UserError: there is none, or the checkpoint's policy cannot mean it; see `telebip.rl.policy.require_robot`.
+        UserError: the checkpoint's policy cannot mean it; see `telebip.rl.policy.require_robot`.
     """
     from telebip.rl.policy import require_robot
-    from telebip.robot import load_robot
 
-    robot = load_robot(sim.robot)
     compare_robot(checkpoint, sim, robot)
     require_robot(checkpoint, sim, robot, allow_robot_change)
-    return robot
 
 
 def compare_robot(checkpoint: "Checkpoint", sim: "SimConfig", robot: "Robot") -> None:
@@ -161,6 +160,31 @@ def policy_of(checkpoint: "Checkpoint", env: "TelebipEnv", allow_robot_change: b
 
     require_fit(checkpoint, env, allow_robot_change=allow_robot_change)
     return load_policy(checkpoint, env.device)
+
+
+def checked_robot(config: "TaskConfig", is_quiet: bool = False) -> "Robot":
+    """Load a task's robot and let it stand for a second: what is doubtful is said on standard error, a line each.
+
+    Raises:
+        UserError: the robot is no robot that the task can be done with.
+    """
+    from telebip.eval.standing import standing_test
+    from telebip.robot import load_robot
+
+    robot = load_robot(config.sim.robot)
+    findings = standing_test(config, robot)
+    refuse_wrong(findings, robot)
+    for finding in findings:
+        if finding.verdict == "warning" and not is_quiet:
+            print(f"warning: {robot.path}: {finding}", file=sys.stderr)
+    return robot
+
+
+def refuse_wrong(findings: "Sequence[Finding]", robot: "Robot") -> None:
+    """Raise a `UserError` for the first of a standing test's findings that is an error."""
+    for finding in findings:
+        if finding.verdict == "error":
+            raise UserError(f"{robot.path}: {finding}")
 
 
 def check_connect(options: argparse.Namespace) -> None:

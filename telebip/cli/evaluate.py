@@ -9,7 +9,7 @@ from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 
-from telebip.cli.common import CONTROLLERS, Parser, open_policy, open_robot, policy_of, resolve_device
+from telebip.cli.common import CONTROLLERS, Parser, checked_robot, match_robot, open_policy, policy_of, resolve_device
 from telebip.config import load_task
 from telebip.errors import UserError
 
@@ -70,9 +70,8 @@ def measure(console, candidate, suites: Sequence[str], protocol, out: Path) -> d
     """Measure a candidate with a progress bar, write `out`/results.json, and return what stands in it."""
     from telebip.eval.report import make_folder, write_results
     from telebip.eval.suites import evaluate
-    from telebip.robot import load_robot
 
-    robot = load_robot(candidate.task.sim.robot)
+    robot = checked_robot(candidate.task)
     make_folder(out)
     with progress_bar(console) as show:
         results = evaluate(candidate, robot, suites, protocol, show)
@@ -126,12 +125,15 @@ def checkpoint_candidate(
 ):
     """Return what a checkpoint holds for the evaluator; the label is the name of its task unless one is given."""
     from telebip.eval.suites import Candidate
+    from telebip.robot import load_robot
     from telebip.robot_record import describe_robot
 
     checkpoint = open_policy(checkpoint_path)
     sim = load_task(checkpoint.config, overrides).sim
-    robot = describe_robot(open_robot(checkpoint, sim, allow_robot_change), sim.decimation)
-    what = checkpoint.path.read_bytes() + repr((robot["digest"], robot["decimation"])).encode()
+    robot = load_robot(sim.robot)
+    match_robot(checkpoint, sim, robot, allow_robot_change)
+    record = describe_robot(robot, sim.decimation)
+    what = checkpoint.path.read_bytes() + repr((record["digest"], record["decimation"])).encode()
     return Candidate(
         label=label or checkpoint.task,
         config=checkpoint.config,

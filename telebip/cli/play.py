@@ -6,7 +6,16 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from telebip.cli.common import CONTROLLERS, Parser, check_connect, open_policy, open_robot, policy_of, resolve_device
+from telebip.cli.common import (
+    CONTROLLERS,
+    Parser,
+    check_connect,
+    checked_robot,
+    match_robot,
+    open_policy,
+    policy_of,
+    resolve_device,
+)
 from telebip.cli.evaluate import progress_bar, speed
 from telebip.config import TaskConfig, load_task
 from telebip.control.config import split_overrides
@@ -55,7 +64,6 @@ def _play(options: argparse.Namespace) -> None:
         from telebip.control.factory import with_estimate
         from telebip.env import TelebipEnv
         from telebip.eval.walk import summarise
-        from telebip.robot import load_robot
         from telebip.rollout import roll_out
 
     if options.viewer == "rerun":
@@ -64,8 +72,9 @@ def _play(options: argparse.Namespace) -> None:
         require_viewer(options.connect)
     device = resolve_device(options.device)
     is_other = options.allow_robot_change
-    robot = open_robot(checkpoint, config.sim, is_other) if checkpoint else load_robot(config.sim.robot)
+    robot = checked_robot(config)
     if checkpoint:
+        match_robot(checkpoint, config.sim, robot, is_other)
         _warn_untrained(console, command, checkpoint.config)
     rollouts = []
     for name in ["RL" if checkpoint else options.controller or options.agent, *options.beside]:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from telebip.cli.common import Parser, check_outputs, resolve_device
+from telebip.cli.common import Parser, check_outputs, checked_robot, resolve_device
 from telebip.config import check, load_task, task_names
 from telebip.errors import UserError
 
@@ -31,7 +31,6 @@ def main(argv: Sequence[str] | None = None) -> None:
         from telebip.eval import plots
         from telebip.rl.process import keep_freed_memory
         from telebip.rl.run import describe_code
-        from telebip.robot import load_robot
         from telebip.tools.measuring import machine_name
         from telebip.tools.race import RACERS, race, sentence, verdict
 
@@ -40,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     device, threads = resolve_device(options.device), torch.get_num_threads()
     if device.type == "cpu":
         keep_freed_memory()
-    robot, machine = load_robot(first.sim.robot), machine_name(device)
+    robot, machine = checked_robot(first), machine_name(device)
     iterations = -(-options.samples // (first.num_envs * first.ppo.num_steps_per_env))
 
     races, done = [], 0

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from telebip.cli.common import Parser, check_outputs, resolve_device
+from telebip.cli.common import Parser, check_outputs, checked_robot, resolve_device
 from telebip.config import check, load_task, task_names
 from telebip.errors import UserError
 
@@ -31,7 +31,6 @@ def main(argv: Sequence[str] | None = None) -> None:
         from telebip.eval import plots
         from telebip.rl.process import keep_freed_memory
         from telebip.rl.run import describe_code
-        from telebip.robot import load_robot
         from telebip.tools.measuring import machine_name
         from telebip.tools.sweep import train_once, verdict
 
@@ -44,7 +43,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     with progress_bar(console) as show:
         for label, seeds in configs.items():
             for config in seeds:
-                robot = load_robot(config.sim.robot)
+                robot = checked_robot(config)
                 result = train_once(options.task, config, robot, device, options.backend, not options.whole, show)
                 results[label].append(result)
                 console.print(f"{label}, seed {config.seed}: {_walked(verdict([result]))}")

@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from telebip.cli.common import Parser, check_connect, compare_robot, invocation, open_checkpoint, resolve_device
+from telebip.cli.check import check
+from telebip.cli.common import Parser, check_connect, checked_robot, compare_robot, invocation, open_checkpoint, resolve_device
 from telebip.config import TaskConfig, load_task, task_names
 from telebip.errors import UserError
 from telebip.viz.opengl import choose_opengl
@@ -26,6 +27,7 @@ EXAMPLES = """\
   train.py --task telebip_flat
   train.py --task telebip_fast --num-envs 2048 --max-iterations 500 ppo.num_steps_per_env=24
   train.py --resume runs/telebip_flat/2026-01-31_12-00-00 --max-iterations 400
+  train.py --task robots/mine.yaml --check --picture stand.png    (is the robot fit to be trained?)
   train.py --task telebip_flat --viewer rerun               (curves and robots, live)
   tensorboard --logdir runs
 """
@@ -61,9 +63,11 @@ class View:
 def main(argv: Sequence[str] | None = None) -> None:
     """Parse arguments and train."""
     options = _parse(argv)
-    if options.record:
+    if options.record or options.picture:
         choose_opengl()
     start = _resumed(options) if options.resume else _new(options)
+    if options.check:
+        return check(start.task, start.config, Path(options.picture) if options.picture else None)
     view = View(options.viewer == "rerun", options.connect, options.record)
     train(start, options.device, options.backend, options.until_walking, view)
 
@@ -209,10 +213,9 @@ def _make_trainer(start: Start, ranks: "Ranks", device: str, backend: "Backend",
     """Create this process's worlds, of a seed of their own, and its learner."""
     from telebip.env import TelebipEnv
     from telebip.rl.train import Trainer
-    from telebip.robot import load_robot
 
     config = replace(start.config, seed=start.config.seed + ranks.rank)
-    env = TelebipEnv(config, load_robot(config.sim.robot), device, backend)
+    env = TelebipEnv(config, checked_robot(config, is_quiet=not ranks.is_main), device, backend)
     return Trainer(env, start.task, Path(), ranks, note=lambda line: console.print(f"note: {line}"))
 
 
@@ -296,6 +299,12 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--record", action="store_true", help="at the end, leave walk.rrd, walk.png and learning.png in the run's folder"
     )
+    parser.add_argument(
+        "--check", action="store_true", help="train nothing: let the robot stand for a second, and say what is wrong"
+    )
+    parser.add_argument(
+        "--picture", metavar="FILE.png", help="with --check, draw it in its home pose, and as it stands at last"
+    )
     parser.add_argument("--viewer", choices=("none", "rerun"), default="none", help="watch the training (default: none)")
     parser.add_argument("--connect", metavar="HOST:PORT", help="a running rerun viewer (default: start one here)")
     parser.add_allow_robot_change()
@@ -304,6 +313,8 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     check_connect(options)
     if options.allow_robot_change and not options.resume:
         raise UserError("--allow-robot-change goes with --resume: a new run has no other robot")
+    if options.picture and not options.check:
+        raise UserError("--picture shows what --check has found; it goes with --check")
     if options.resume and options.log_dir:
         raise UserError("--resume goes on in the run's own folder; leave out --log-dir")
     return options

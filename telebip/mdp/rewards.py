@@ -58,9 +58,10 @@ def tq(step: Step, *, k_tq: Annotated[float, Quantity(le=0)]) -> Tensor:
     r"""Penalty on actuator effort: r_tq = k_tq ||tau_t / tau_limit||, (num_envs,) [-].
 
     The article's ||tau_t|| would add N m of the hips to N of the prismatic knees; each entry is divided by its actuator's
-    force limit first, so that the norm is dimensionless and 1 means one saturated actuator.
+    force limit first, that of the force's sign, so that the norm is dimensionless and 1 means one saturated actuator.
     """
-    return k_tq * norm(step.state.joint_force / step.world.force_limit)
+    force, (low, high) = step.state.joint_force, step.world.force_range.unbind(1)
+    return k_tq * norm(force / torch.where(force < 0.0, -low, high))
 
 
 def _foot_window(world: World, **_) -> Memory:

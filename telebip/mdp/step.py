@@ -33,7 +33,7 @@ class World:
     gait_period: float  # T [s]
     home_qpos: Tensor  # (nq,)
     nominal: Tensor  # joint positions of the home pose [rad | m], (num_joints,)
-    force_limit: Tensor  # of the actuators [N m | N], (num_joints,)
+    force_range: Tensor  # of the actuators, negative and positive [N m | N], (num_joints, 2)
     action_scale: Tensor  # displacement of a joint target per unit of action [rad | m], (num_joints,)
     foot_lift: Tensor  # by how much each foot rises with each joint in the home pose [m/rad | -], (2, num_joints)
     ground: Ground | None  # None where it is flat, at height 0

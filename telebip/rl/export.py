@@ -78,7 +78,7 @@ def describe(checkpoint: Checkpoint, robot: Robot) -> dict[str, Any]:
         "action_scale": scales(config.actions.scale, robot.joint_names),  # joint target = nominal + scale * action
         "stiffness": model.actuator_gainprm[:, 0].tolist(),
         "damping": (-model.actuator_biasprm[:, 2]).tolist(),
-        "force_limit": robot.force_limit.tolist(),
+        "force_range": robot.force_range.tolist(),
         # Stiffness and damping: per joint_unit, and per joint_unit/s.
         "force_unit": ["N" if slide else "N m" for slide in robot.is_slide],
         # One frame, its parts in their order. The network takes SI units as they are (scale 1): it normalises itself.

@@ -10,7 +10,7 @@ import torch
 from mujoco.batch import Batch, SimulationError
 from torch import Tensor
 
-from telebip.robot import FEET, TRUNK, Robot, ground_force_sensor
+from telebip.robot import FEET, Robot, ground_force_sensor
 from telebip.sim.base import ENGINE_FAULTS, Backend, SimState, derives, home_data, require_whole_state, state_fields
 
 CAPACITY = [mujoco.mjtWarning.mjWARN_CONTACTFULL.value, mujoco.mjtWarning.mjWARN_CNSTRFULL.value]
@@ -50,7 +50,7 @@ class NativeSimulator:
         self._default = np.empty(self.batch.nstate)  # the engine's whole state in the keyframe `home`
         mujoco.mj_getState(self.model, home_data(self.model), self._default, mujoco.mjtState.mjSTATE_INTEGRATION)
         self._ctrl = torch.from_numpy(self.batch.bind("ctrl"))
-        self._trunk_wrench = torch.from_numpy(self.batch.bind("xfrc_applied"))[:, self.model.body(TRUNK).id]
+        self._trunk_wrench = torch.from_numpy(self.batch.bind("xfrc_applied"))[:, self.model.jnt_bodyid[0]]
         # Every physics step's values, (num_envs, decimation, ...), written by the engine's threads.
         sizes = {"actuator_force": self.model.nu, "actuator_velocity": self.model.nu, "sensordata": self.model.nsensordata}
         self._record = {name: np.zeros((num_envs, decimation, size)) for name, size in sizes.items()}
@@ -70,7 +70,7 @@ class NativeSimulator:
             self._ctrl.copy_(targets)
         for before, live in zip(self.memory_before.values(), memory.values(), strict=True):
             before.copy_(live)
-        with _silence(), contextlib.suppress(SimulationError):  # those worlds keep the state that they had
+        with silent_engine(), contextlib.suppress(SimulationError):  # those worlds keep the state that they had
             self.batch.rollout(self._decimation, control=schedule, record=tuple(self._record), out=self._record)
         self._read_faults()
         state.qpos.copy_(memory["qpos"])
@@ -124,7 +124,7 @@ class NativeSimulator:
 
 
 @contextlib.contextmanager
-def _silence() -> Iterator[None]:
+def silent_engine() -> Iterator[None]:
     """Keep the engine from writing each warning to the console and to a file in the working directory; `faults` has them."""
     before, quiet = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
     quiet.logto_console = quiet.logto_file = False

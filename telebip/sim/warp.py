@@ -15,7 +15,7 @@ from torch import Tensor
 from telebip.errors import UserError
 from telebip.graph import no_garbage_collection
 from telebip.math import over
-from telebip.robot import FEET, TRUNK, Robot, ground_force_sensor
+from telebip.robot import FEET, Robot, ground_force_sensor
 from telebip.sim.base import ENGINE_FAULTS, MEANS, Backend, SimState, derives, home_data, require_whole_state, state_fields
 from telebip.sim.ordering import CanonicalOrder
 
@@ -145,7 +145,7 @@ class WarpSimulator:
         self._means = [wp.from_torch(getattr(self.state, name)) for name in MEANS]
         self._ctrl, self._overflow = wp.to_torch(data.ctrl), wp.to_torch(data.overflow)
         self._targets = [wp.to_torch(controls) for controls in self._schedule]
-        self._trunk_wrench = wp.to_torch(data.xfrc_applied)[:, self.model.body(TRUNK).id]
+        self._trunk_wrench = wp.to_torch(data.xfrc_applied)[:, self.model.jnt_bodyid[0]]
         self._foot_adr = [int(self.model.sensor(ground_force_sensor(foot)).adr[0]) + 2 for foot in FEET]
         self.advice = {
             "capacity": f"raise sim.max_contacts ({max_contacts}) or sim.max_constraints ({max_constraints}), both per world"

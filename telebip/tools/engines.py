@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from telebip.env import TelebipEnv
-from telebip.robot import TRUNK
 from telebip.tools.measuring import Stopwatch
 
 
@@ -54,7 +53,7 @@ class BareEngine:
     def __init__(self, env: TelebipEnv) -> None:
         """Take the engine out of `env`."""
         self._sim, self._steps, self._device = env.sim, env.cfg.sim.decimation, env.device
-        self._trunk = env.sim.model.body(TRUNK).id
+        self._trunk = int(env.sim.model.jnt_bodyid[0])
         make = _native if env.sim.backend == "native" else _warp
         self._ctrl, self._xfrc, self._warnings, self._run = make(env.sim, self._steps)
 

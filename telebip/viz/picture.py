@@ -1,5 +1,6 @@
 """A still picture of a walk: the robot at equal intervals, all in one scene."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,7 @@ from PIL import Image
 
 from telebip.errors import UserError
 from telebip.robot import Robot
-from telebip.viz.render import Renderer
+from telebip.viz.render import Array, Renderer
 from telebip.viz.scene import Actor
 
 
@@ -36,6 +37,24 @@ def strobe(
         renderer.look_at([*centre, 0.4], distance=1.0 + 0.5 * span, azimuth=azimuth, elevation=-9.0)
         renderer.place(list(rows))
         picture = Image.fromarray(renderer.render())
+    _save(picture, file)
+
+
+def side_by_side(poses: Sequence[Array], robot: Robot, file: Path, size: tuple[int, int] = (1200, 640)) -> None:
+    """Render poses (nq) of the robot beside each other, seen from the front left.
+
+    Raises:
+        UserError: there is no OpenGL to render with, or the file cannot be written.
+    """
+    height = float(robot.home_qpos[2])
+    rows = [np.concatenate([[0.0, 1.2 * height * (0.5 * (len(poses) - 1) - i)], qpos[2:]]) for i, qpos in enumerate(poses)]
+    with Renderer(robot, size, extent=4.0 * height) as renderer:
+        renderer.look_at([0.0, 0.0, 0.7 * height], distance=3.2 * height, azimuth=205.0, elevation=-12.0)
+        renderer.place(rows)
+        _save(Image.fromarray(renderer.render()), file)
+
+
+def _save(picture: Image.Image, file: Path) -> None:
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         picture.save(file)

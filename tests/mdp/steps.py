@@ -45,7 +45,7 @@ def make_world(robot: Robot, num_envs: int = 1, gait_period: float = 0.5, fields
         gait_period=gait_period,
         home_qpos=torch.as_tensor(robot.home_qpos).float(),
         nominal=torch.as_tensor(robot.nominal).float(),
-        force_limit=torch.as_tensor(robot.force_limit).float(),
+        force_range=torch.as_tensor(robot.force_range).float(),
         action_scale=SCALE,
         foot_lift=torch.as_tensor(robot.foot_lift).float(),
         ground=Ground(robot.terrain, CPU) if robot.terrain else None,

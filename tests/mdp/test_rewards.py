@@ -15,7 +15,7 @@ from telebip.mdp.step import Step
 from telebip.mdp.term import TERMS
 from telebip.robot import Robot
 
-FORCE_LIMIT = torch.tensor([50.0, 50.0, 400.0, 50.0, 50.0, 400.0])
+FORCE_RANGE = torch.tensor([[-50.0, 50.0], [-50.0, 50.0], [-400.0, 400.0]] * 2)
 
 
 def moving(command: Tensor, lin_vel: Tensor | None = None, ang_vel: Tensor | None = None) -> Any:
@@ -89,7 +89,7 @@ def test_action_difference_is_the_norm_of_the_change() -> None:
     ],
 )
 def test_torque_counts_saturated_actuators(force: list[float], expected: float) -> None:
-    state, world = SimpleNamespace(joint_force=torch.tensor([force])), SimpleNamespace(force_limit=FORCE_LIMIT)
+    state, world = SimpleNamespace(joint_force=torch.tensor([force])), SimpleNamespace(force_range=FORCE_RANGE)
     step: Any = SimpleNamespace(state=state, world=world)
     torch.testing.assert_close(rewards.tq(step, k_tq=-0.05), torch.tensor([expected]))
 

@@ -90,7 +90,7 @@ def test_the_description_is_complete_and_true(exported: Path, shipped: Checkpoin
     assert about["action_scale"] == [0.25, 0.5, 0.1] * 2
     assert about["stiffness"] == [200.0, 200.0, 6000.0] * 2
     assert about["damping"] == [6.0, 6.0, 200.0] * 2
-    assert about["force_limit"] == [50.0, 50.0, 400.0] * 2
+    assert about["force_range"] == [[-50.0, 50.0], [-50.0, 50.0], [-400.0, 400.0]] * 2
     assert about["force_unit"] == ["N m", "N m", "N"] * 2
     assert [(part["name"], part["size"]) for part in about["observation"]][:2] == [("joint_pos", 6), ("joint_vel", 6)]
     assert sum(part["size"] for part in about["observation"]) == 33
