@@ -1,8 +1,9 @@
 # pyright: reportAttributeAccessIssue=false
 """The robot as its MJCF describes it: its actuated joints, nominal pose, limits, feet and mirror image."""
 
+import contextlib
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -190,10 +191,23 @@ def load_robot(path: str | Path) -> Robot:
     )
 
 
+@contextlib.contextmanager
+def silent_engine() -> Iterator[None]:
+    """Keep the engine from writing its warnings to the console and to a file in the working directory."""
+    before, quiet = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
+    quiet.logto_console = quiet.logto_file = False
+    quiet.set()
+    try:
+        yield
+    finally:
+        before.set()
+
+
 def _read(file: Path, path: str | Path) -> mujoco.MjSpec:
     """Parse an MJCF; errors name it as `path`."""
     try:
-        return mujoco.MjSpec.from_file(str(file))
+        with silent_engine():
+            return mujoco.MjSpec.from_file(str(file))
     except (ValueError, OSError, mujoco.FatalError) as error:
         raise UserError(f"{path}: {error}") from error
 
@@ -201,7 +215,8 @@ def _read(file: Path, path: str | Path) -> mujoco.MjSpec:
 def _compiled(spec: mujoco.MjSpec, path: str | Path) -> mujoco.MjModel:
     """Compile an MJCF, with its actuators in the units of their joints."""
     try:
-        model = spec.compile()
+        with silent_engine():
+            model = spec.compile()
     except (ValueError, mujoco.FatalError) as error:
         raise UserError(f"{path}: {error}") from error
     in_joint_units(model)

@@ -241,12 +241,12 @@ def _feet(model: mujoco.MjModel, data: mujoco.MjData, parts: Parts) -> Iterator[
     right, left = (to_the_left(data, parts.trunk, data.site_xpos[site]) for site in sites)
     if right > left + 1e-3:
         yield (
-            f"sensor '{model.sensor(parts.feet[0]).name}' is on the left foot and the other on the right (x is forward, y to the "
-            "left); swap their sites"
+            f"sensor '{model.sensor(parts.feet[0]).name}' is on the left foot and the other on the right "
+            "(x is forward, y to the left); swap their sites"
         )
 
 
-def can_collide(model: mujoco.MjModel, a: int, b: int) -> bool:
+def can_collide(model: mujoco.MjModel, a: int | np.intp, b: int | np.intp) -> bool:
     """Whether two geoms can touch, by their bits or as a pair."""
     bits = model.geom_contype[a] & model.geom_conaffinity[b] or model.geom_contype[b] & model.geom_conaffinity[a]
     pairs = zip(model.pair_geom1, model.pair_geom2, strict=True)

@@ -73,6 +73,10 @@ def _play(options: argparse.Namespace) -> None:
     device = resolve_device(options.device)
     is_other = options.allow_robot_change
     robot = checked_robot(config)
+    if options.viewer == "rerun" or (options.record and Path(options.record).suffix == ".rrd"):
+        from telebip.viz.rerun import drawable
+
+        drawable(robot)
     if checkpoint:
         match_robot(checkpoint, config.sim, robot, is_other)
         _warn_untrained(console, command, checkpoint.config)

@@ -143,6 +143,10 @@ def train(
     with joined(ranks, device), ExitStack() as stack:
         with console.status("creating the worlds (the warp backend compiles for a minute or two the first time)"):
             trainer = _make_trainer(start, ranks, str(device), backend, console)
+        if is_watched or view.record:
+            from telebip.viz.rerun import drawable
+
+            drawable(trainer.env.robot)
         if ranks.is_main:  # after all that may be refused, so that this leaves no empty folder
             trainer.run_dir = stack.enter_context(_own_folder(start))
         if start.checkpoint and ranks.is_main:
@@ -300,11 +304,9 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         "--record", action="store_true", help="at the end, leave walk.rrd, walk.png and learning.png in the run's folder"
     )
     parser.add_argument(
-        "--check", action="store_true", help="train nothing: let the robot stand for a second, and say what is wrong"
+        "--check", action="store_true", help="train nothing: let the robot stand, and say what is wrong with it"
     )
-    parser.add_argument(
-        "--picture", metavar="FILE.png", help="with --check, draw it in its home pose, and as it stands at last"
-    )
+    parser.add_argument("--picture", metavar="FILE.png", help="with --check, draw it in its home pose and a second later")
     parser.add_argument("--viewer", choices=("none", "rerun"), default="none", help="watch the training (default: none)")
     parser.add_argument("--connect", metavar="HOST:PORT", help="a running rerun viewer (default: start one here)")
     parser.add_allow_robot_change()

@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 from telebip.config import TaskConfig
 from telebip.env import TelebipEnv
 from telebip.mdp.actions import scales
-from telebip.robot import FEET, FOOT_SENSORS, Robot
+from telebip.robot import FEET, FOOT_SENSORS, Robot, silent_engine
 from telebip.robot_check import can_collide
-from telebip.sim.native import silent_engine
 
 SECONDS = 1.0
 WORLDS = 8
@@ -160,7 +159,7 @@ def clearance(robot: Robot) -> NDArray[np.float64]:
 
 
 def _place(robot: Robot) -> Iterator[Finding]:
-    """Judge where the feet are in the home pose: within 1 % of the hips' height on the ground, or it is said; 5 % are refused."""
+    """Judge where the feet are in the home pose: off the ground by 1 % of the hips' height is said, by 5 % refused."""
     hips, heights = float(robot.home_qpos[2]), clearance(robot)
     for foot, height in zip(FEET, heights, strict=True):
         check, share = f"{foot} at home", abs(height) / max(hips, 1e-9)
@@ -272,7 +271,7 @@ def _overlaps(robot: Robot) -> Iterator[Finding]:
 
 
 def _terms(config: TaskConfig, robot: Robot) -> Iterator[Finding]:
-    """Judge the task's terms in a handful of worlds: the first holds the pose, the others act at random, half are pushed over."""
+    """Judge the task's terms in worlds of which one holds the pose and the others act at random; half are pushed over."""
     groups = {name: replace(group, noise=False) for name, group in config.observations.items()}
     env = TelebipEnv(replace(config, num_envs=WORLDS, observations=groups), robot, "cpu", "native")
     generator, steps = torch.Generator().manual_seed(0), max(2, min(200, round(SECONDS / env.step_dt)))

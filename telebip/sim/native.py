@@ -2,7 +2,7 @@
 """C MuJoCo on a thread pool: the engine of machines without a GPU, bit-identical to a loop of `mj_step`."""
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -10,7 +10,7 @@ import torch
 from mujoco.batch import Batch, SimulationError
 from torch import Tensor
 
-from telebip.robot import FEET, Robot, ground_force_sensor
+from telebip.robot import FEET, Robot, ground_force_sensor, silent_engine
 from telebip.sim.base import ENGINE_FAULTS, Backend, SimState, derives, home_data, require_whole_state, state_fields
 
 CAPACITY = [mujoco.mjtWarning.mjWARN_CONTACTFULL.value, mujoco.mjtWarning.mjWARN_CNSTRFULL.value]
@@ -121,18 +121,6 @@ class NativeSimulator:
             if failed.any():
                 self.advice["engine_error"] = self.batch.error(int(failed.argmax()))
             self.batch.warning[:] = 0
-
-
-@contextlib.contextmanager
-def silent_engine() -> Iterator[None]:
-    """Keep the engine from writing each warning to the console and to a file in the working directory; `faults` has them."""
-    before, quiet = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
-    quiet.logto_console = quiet.logto_file = False
-    quiet.set()
-    try:
-        yield
-    finally:
-        before.set()
 
 
 def _mean(record: Tensor) -> Tensor:

@@ -61,7 +61,7 @@ class LiveView:
         self._urdf = load_urdf(robot)
         stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         for link in self._urdf.link_map:
-            log_mesh(stream, f"world/{link}", self._urdf, link)
+            log_mesh(stream, f"world/{link}", self._urdf, link, robot)
         self._frames: list[dict[str, list[rr.DescribedComponentBatch]]] = []  # for each frame, poses of each link
         self._closing = threading.Event()
         self._player = threading.Thread(target=self._play, daemon=True)

@@ -17,12 +17,15 @@ from rerun.blueprint import Blueprint
 
 from telebip.errors import UserError
 from telebip.math import yaw
-from telebip.robot import FEET, FOOT_SENSORS, TRUNK, Robot
+from telebip.robot import FEET, FOOT_SENSORS, Robot
 from telebip.viz.blueprint import walk_layout
 from telebip.viz.opengl import has_display
 from telebip.viz.scene import ACTUAL, COMMAND, FORCE_SCALE, GROUND_FORCE, PUSH, PUSH_SCALE, SPEED_SCALE, Actor, Color
 from telebip.viz.series import PALETTE, SHARED, TOTAL, Plot, plots
 from telebip.viz.urdf import Array, joint_transforms, link_mesh, link_paths, load_urdf
+
+FLUSH = 60.0
+"""A viewer that takes longer than this for what is left at the end is taken for one that does not answer [s]."""
 
 
 def record(actors: Sequence[Actor], robot: Robot, file: Path) -> None:
@@ -31,7 +34,7 @@ def record(actors: Sequence[Actor], robot: Robot, file: Path) -> None:
     Raises:
         UserError: the file cannot be written, or the URDF is missing or has shapes that cannot be drawn.
     """
-    urdf = load_urdf(robot)
+    urdf = drawable(robot)
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         file.open("wb").close()  # rerun writes in a thread of its own and would only log a failure
@@ -49,22 +52,44 @@ def show(actors: Sequence[Actor], robot: Robot, address: str | None = None) -> N
     Raises:
         UserError: as `record`, or there is no viewer at `address`, or no display for one here.
     """
-    urdf = load_urdf(robot)
+    urdf = drawable(robot)
     with viewer(_layout(actors, robot), address) as stream:
         log_walks(stream, actors, robot, urdf)
 
 
+def drawable(robot: Robot) -> yourdfpy.URDF:
+    """Load a robot's URDF, and all of its shapes once, so that what cannot be drawn is said before anything is walked.
+
+    Raises:
+        UserError: see `load_urdf` and `link_mesh`.
+    """
+    urdf = load_urdf(robot)
+    for link in urdf.link_map:
+        link_mesh(urdf, link, robot.path.with_suffix(".urdf"))
+    return urdf
+
+
 @contextmanager
 def viewer(layout: Blueprint, address: str | None) -> Iterator[rr.RecordingStream]:
-    """Yield a stream into a rerun viewer, and wait at the end until everything has arrived; see `show`."""
+    """Yield a stream into a rerun viewer, and wait at the end until everything has arrived; see `show`.
+
+    Raises:
+        UserError: there is no viewer, or not all of it has arrived there.
+    """
     url = require_viewer(address)
     stream = rr.RecordingStream("telebip")
-    if url:
-        stream.connect_grpc(url, default_blueprint=layout)
-    else:
-        stream.spawn(default_blueprint=layout)
+    try:
+        if url:
+            stream.connect_grpc(url, default_blueprint=layout)
+        else:
+            stream.spawn(default_blueprint=layout)
+    except (RuntimeError, OSError, ValueError) as error:
+        raise UserError(f"the rerun viewer does not start: {error}") from error
     try:
         yield stream
+        stream.flush(timeout_sec=FLUSH)
+    except RuntimeError as error:
+        raise UserError(f"the rerun viewer at '{address or 'this machine'}' did not take it all: {error}") from error
     finally:
         stream.disconnect()
 
@@ -88,10 +113,20 @@ def require_viewer(address: str | None) -> str | None:
     except ValueError as error:
         raise UserError(f"'{address}' is no address of a rerun viewer: {error}") from error
     try:
-        socket.create_connection((host, port), timeout=3.0).close()  # rerun itself would retry for ever
+        with socket.create_connection((host, port), timeout=3.0) as connection:  # rerun itself would retry for ever
+            speaks = urlsplit(url).scheme != "rerun+http" or _speaks_http2(connection)
     except OSError as error:
         raise UserError(f"no rerun viewer answers at '{address}': {error.strerror or error}") from error
+    if not speaks:
+        raise UserError(f"what answers at '{address}' is no rerun viewer; its port is 9876, if not chosen otherwise")
     return url
+
+
+def _speaks_http2(connection: socket.socket) -> bool:
+    """Whether an HTTP/2 preface with empty settings is answered by settings (RFC 9113, 3.4), as rerun's gRPC does."""
+    settings = b"\0\0\0" + b"\4" + b"\0" + b"\0\0\0\0"  # length, type, flags, stream
+    connection.sendall(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + settings)
+    return connection.recv(4)[3:] == settings[3:4]
 
 
 def log_walks(stream: rr.RecordingStream, actors: Sequence[Actor], robot: Robot, urdf: yourdfpy.URDF) -> None:
@@ -102,7 +137,7 @@ def log_walks(stream: rr.RecordingStream, actors: Sequence[Actor], robot: Robot,
         stream.log(f"world/{name}", rr.Transform3D(translation=[0.0, actor.lane, 0.0]), static=True)
         if len(actors) > 1:
             above = rr.Points3D([[0.0, 0.0, 0.4]], radii=0.005, colors=[250, 250, 250], labels=[actor.label], show_labels=True)
-            stream.log(f"world/{name}/{TRUNK}/label", above, static=True)
+            stream.log(f"world/{name}/{robot.trunk_name}/label", above, static=True)
         _log_links(stream, urdf, robot, f"world/{name}", actor, time)
         _log_arrows(stream, robot, f"world/{name}", actor, time)
         own = PALETTE[i % len(PALETTE)] if len(actors) > 1 else None
@@ -118,9 +153,9 @@ def names(actors: Sequence[Actor]) -> list[str]:
     return found
 
 
-def log_mesh(stream: rr.RecordingStream, path: str, urdf: yourdfpy.URDF, link: str) -> None:
+def log_mesh(stream: rr.RecordingStream, path: str, urdf: yourdfpy.URDF, link: str, robot: Robot) -> None:
     """Log the shape of a link, if it has one."""
-    mesh = link_mesh(urdf, link)
+    mesh = link_mesh(urdf, link, robot.path.with_suffix(".urdf"))
     if mesh is not None:
         shape = rr.Mesh3D(
             vertex_positions=mesh.vertices,
@@ -137,9 +172,9 @@ def _log_links(
     """Log the links' shapes, the trunk's pose in the lane, and every other link's in its parent's."""
     qpos, paths = actor.rollout.qpos[:, actor.world], link_paths(urdf)
     for link, path in paths.items():
-        log_mesh(stream, f"{root}/{path}", urdf, link)
+        log_mesh(stream, f"{root}/{path}", urdf, link, robot)
     trunk = rr.Transform3D.columns(translation=qpos[:, :3], quaternion=np.roll(qpos[:, 3:7], -1, axis=1))
-    stream.send_columns(f"{root}/{TRUNK}", indexes=[time], columns=trunk)
+    stream.send_columns(f"{root}/{robot.trunk_name}", indexes=[time], columns=trunk)
     for link, pose in joint_transforms(urdf, robot, qpos).items():
         columns = rr.Transform3D.columns(translation=pose[:, :3, 3], mat3x3=pose[:, :3, :3])
         stream.send_columns(f"{root}/{paths[link]}", indexes=[time], columns=columns)

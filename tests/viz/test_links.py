@@ -7,6 +7,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+import trimesh
 
 from telebip.errors import UserError
 from telebip.robot import Robot
@@ -69,7 +70,7 @@ def test_an_origin_that_is_turned_turns_the_axis_with_it(robot: Robot, urdf: Pat
 
 def test_a_link_is_one_mesh_in_its_colours(robot: Robot) -> None:
     urdf = load_urdf(robot)
-    foot, thigh = link_mesh(urdf, "right_foot"), link_mesh(urdf, "right_thigh")
+    foot, thigh = (link_mesh(urdf, link, robot.path.with_suffix(".urdf")) for link in ("right_foot", "right_thigh"))
     assert foot is not None and thigh is not None
     np.testing.assert_allclose(np.linalg.norm(foot.vertices, axis=1), 0.03, atol=1e-9)
     assert {tuple(color) for color in foot.visual.vertex_colors.tolist()} == {(20, 20, 23, 255)}
@@ -97,8 +98,74 @@ def test_a_urdf_that_is_not_this_robot_is_one_line(
         load_urdf(beside(robot, tmp_path / "nowhere.urdf"))
 
 
-def test_a_mesh_file_is_refused(robot: Robot, urdf: Path, tmp_path: Path) -> None:
+def with_a_mesh(urdf: Path, folder: Path, mesh: str) -> Path:
+    """Write the shipped URDF with the feet's spheres replaced."""
+    other = folder / "other.urdf"
+    other.write_text(urdf.read_text().replace('<sphere radius="0.03"/>', mesh))
+    return other
+
+
+@pytest.mark.parametrize("name", ["foot.stl", "foot.obj", "foot.ply"])
+def test_a_mesh_is_drawn_at_its_scale(robot: Robot, urdf: Path, tmp_path: Path, name: str) -> None:
+    trimesh.creation.box(extents=(0.1, 0.2, 0.3)).export(tmp_path / name)
+    other = with_a_mesh(urdf, tmp_path, f'<mesh filename="{name}" scale="2 1 1"/>')
+    foot = link_mesh(load_urdf(beside(robot, other)), "right_foot", other)
+    assert foot is not None
+    np.testing.assert_allclose(foot.extents, [0.2, 0.2, 0.3], atol=1e-6)
+    assert {tuple(color) for color in foot.visual.vertex_colors.tolist()} == {(20, 20, 23, 255)}  # the URDF's, not the file's
+
+
+def test_a_mesh_of_a_package_is_found_beside_the_urdf(robot: Robot, urdf: Path, tmp_path: Path) -> None:
+    (tmp_path / "meshes").mkdir()
+    trimesh.creation.icosphere(radius=0.05).export(tmp_path / "meshes" / "ball.stl")
+    other = with_a_mesh(urdf, tmp_path, '<mesh filename="package://mine/meshes/ball.stl"/>')
+    foot = link_mesh(load_urdf(beside(robot, other)), "left_foot", other)
+    assert foot is not None and foot.extents.max() == pytest.approx(0.1, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("mesh", "content", "said"),
+    [
+        ('<mesh filename="gone.stl"/>', b"", "mesh 'gone.stl' does not exist"),
+        ('<mesh filename="broken.stl"/>', b"solid nothing", "no finite shape"),
+        ('<mesh filename="broken.stl"/>', b"\x00" * 200, ""),
+        ('<mesh filename="broken.xyz9"/>', b"1 2 3", "mesh"),
+        ("<mesh/>", b"", ""),
+        ('<sphere radius="nan"/>', b"", "no finite shape"),
+    ],
+)
+def test_a_shape_that_cannot_be_drawn_is_named(
+    robot: Robot, urdf: Path, tmp_path: Path, mesh: str, content: bytes, said: str
+) -> None:
+    for name in ("broken.stl", "broken.xyz9"):
+        (tmp_path / name).write_bytes(content)
+    other = with_a_mesh(urdf, tmp_path, mesh)
+    with pytest.raises(UserError) as error:
+        link_mesh(load_urdf(beside(robot, other)), "right_foot", other)
+    message = str(error.value)
+    assert message.startswith(f"{other}: link 'right_foot' cannot be drawn") and said in message
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        (
+            '<child link="left_foot"/>',
+            '<child link="right_foot"/>',
+            "moves link 'right_foot', which another joint moves already",
+        ),
+        ('<parent link="left_shank"/>', '<parent link="left_shin"/>', "names the link 'left_shin', which is not there"),
+        ('<parent link="left_shank"/>', '<parent link="left_foot"/>', "does not hang on link 'trunk'"),
+        (
+            '<parent link="trunk"/>\n    <child link="left_hip"/>',
+            '<parent link="left_hip"/>\n    <child link="trunk"/>',
+            "root",
+        ),
+    ],
+)
+def test_links_that_form_no_tree_are_named(robot: Robot, urdf: Path, tmp_path: Path, old: str, new: str, said: str) -> None:
+    assert old in urdf.read_text()
     other = tmp_path / "other.urdf"
-    other.write_text(urdf.read_text().replace('<sphere radius="0.03"/>', '<mesh filename="foot.stl"/>'))
-    with pytest.raises(UserError, match="box, cylinder and sphere"):
-        link_mesh(load_urdf(beside(robot, other)), "right_foot")
+    other.write_text(urdf.read_text().replace(old, new))
+    with pytest.raises(UserError, match=said):
+        load_urdf(beside(robot, other))
