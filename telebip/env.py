@@ -1,5 +1,6 @@
 """The vectorised environment: the order of one step, and nothing else. Every term it calls lives in `telebip.mdp`."""
 
+import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -249,16 +250,20 @@ class TelebipEnv(VecEnv):
         fault = faults.any(0)
         terminations = torch.stack([term(step) for term in self._terminations.values()] or [torch.zeros_like(fault)])
         step.fallen = terminations.any(0) | fault
+
+        # 3. Rewards. What is not finite counts as zero and, where no other fault has made it so, is a fault of the term.
+        if self._rewards:
+            self.reward_terms.copy_(torch.stack([term(step) for term in self._rewards.values()]))
+        broken = ~self.reward_terms.isfinite()
+        torch.logical_and(broken.any(0), ~fault, out=faults[-1])
+        self._note_faults(faults)
+        step.fallen = step.fallen | faults[-1]
+        rewards = self.reward_terms.masked_fill_(broken, 0.0)
         has_ended = state.episode_length >= self.max_episode_length
         if ground := self.world.ground:
             has_ended |= ground.distance(step.state.base_pos, state.tile) > 0.5 * ground.size
         time_outs = has_ended & ~step.fallen  # the learner bootstraps there
-        dones = step.fallen | time_outs
-
-        # 3. Rewards. What a fault has made non-finite counts as zero, in its own world alone.
-        if self._rewards:
-            self.reward_terms.copy_(torch.stack([term(step) for term in self._rewards.values()]))
-        rewards = self.reward_terms.masked_fill_(fault & ~self.reward_terms.isfinite(), 0.0)
+        dones, fault = step.fallen | time_outs, faults.any(0)
         logged = log.means(step, rewards, terminations[: len(self._terminations)], faults)
         state.last_action.copy_(self._action)
 
@@ -273,12 +278,16 @@ class TelebipEnv(VecEnv):
         return Outcome(obs, rewards.sum(0), dones, time_outs, logged, final_obs)
 
     def _find_faults(self) -> Tensor:
-        """Return which fault befell which world, bool, (kinds, num_envs), and keep the first of each kind."""
+        """Return which fault befell which world, bool, (kinds, num_envs); that of the rewards is yet to be found."""
+        none = torch.zeros_like(self._finite)[None]
+        return torch.cat([torch.stack([~self._finite, non_finite(self.sim.state)]), self.sim.faults, none])
+
+    def _note_faults(self, faults: Tensor) -> None:
+        """Keep the first fault of each kind."""
         sim, state = self.sim, self.state
-        faults = torch.cat([torch.stack([~self._finite, non_finite(sim.state)]), sim.faults])
         given = {"action": self._given, "targets": self._targets, "wrench_w": state.wrench_w}
-        self._fault_recorder.note(faults, {**sim.memory_before, **sim.model_fields, **given}, state.num_steps)
-        return faults
+        judged = {"reward_terms": self.reward_terms.T}
+        self._fault_recorder.note(faults, {**sim.memory_before, **sim.model_fields, **given, **judged}, state.num_steps)
 
     def get_observations(self) -> TensorDict:
         """Return new observations {group: (num_envs, size)} of the present state, with the step's noise; see `groups`."""
@@ -333,6 +342,15 @@ class TelebipEnv(VecEnv):
     def take_faults(self) -> dict[str, dict[str, Any]]:
         """Return the first faulty world of each kind that has not been taken yet; see `mdp.faults`. Waits for the device."""
         return self._fault_recorder.take()
+
+    def broken_reward(self) -> str:
+        """Return which reward term was the first that was not finite, and where; empty if all were. Waits for the device."""
+        record = self._fault_recorder.first("non_finite_reward")
+        if record is None:
+            return ""
+        values = zip(self.reward_names, record["reward_terms"].tolist(), strict=True)
+        name, value = next((name, value) for name, value in values if not math.isfinite(value))
+        return f"reward '{name}' is {value:g} in world {int(record['world'])}, environment step {int(record['step'])}"
 
     @property
     def episode_length_buf(self) -> Tensor:

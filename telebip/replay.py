@@ -149,7 +149,7 @@ def replay(fault: Fault, backend: Backend | None = None) -> Replay:
     for target in targets:
         sim.step(target[None], record["wrench_w"][None])
         rows = torch.cat([torch.stack([non_finite(sim.state)]), sim.faults])[:, 0]
-        seen |= {kind for kind, found in zip(KINDS[1:], rows.tolist(), strict=True) if found}
+        seen |= {kind for kind, found in zip(KINDS[1:-1], rows.tolist(), strict=True) if found}
         states.append(_copy(sim.state))
         faults.append(set(seen))
     changes = differences(fault.robot, describe_robot(robot, cfg.sim.decimation))

@@ -148,4 +148,5 @@ def judge_faults(env: TelebipEnv) -> None:
         raise UserError(f"contacts or constraints did not fit; {env.sim.advice['capacity']}")
     if faults:
         first = ", ".join(f"{kind} (first at step {int(record['step'])})" for kind, record in faults.items())
-        print(f"note: worlds count as fallen because of {first}", file=sys.stderr)
+        which = f": {env.broken_reward()}" if "non_finite_reward" in faults else ""
+        print(f"note: worlds count as fallen because of {first}{which}", file=sys.stderr)

@@ -133,10 +133,10 @@ if __name__ == "__main__":
     import contextlib
     import os
 
-    kind, folder, first, last = sys.argv[1], Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4])
+    kind, folder, first, last = sys.argv[1], Path(sys.argv[2]).resolve(), int(sys.argv[3]), int(sys.argv[4])
     os.chdir(folder)
     for seed in range(first, last):
         print(f"{seed} tried", flush=True)
-        with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere), contextlib.redirect_stderr(nowhere):
+        with Path(os.devnull).open("w") as nowhere, contextlib.redirect_stdout(nowhere), contextlib.redirect_stderr(nowhere):
             result = outcome(kind, folder, seed)
         print(f"{seed} {result}", flush=True)

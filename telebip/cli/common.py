@@ -3,6 +3,8 @@
 import argparse
 import os
 import re
+import shlex
+import shutil
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -80,6 +82,20 @@ def invocation(command: str) -> str:
     if program.stem == "telebip":
         return f"telebip {command}"
     return f"python {program} {command}" if _is_own_script(program) else f"python scripts/{command}.py"
+
+
+def hint(command: str, *arguments: object) -> str:
+    """Return a line that can be pasted into a shell from any working directory; paths among the arguments become absolute."""
+    program = Path(sys.argv[0])
+    found = shutil.which("python")
+    python = "python" if found and Path(found) == Path(sys.executable) else sys.executable
+    if program.stem == "telebip":
+        start = ["telebip" if shutil.which("telebip") else str(program.absolute()), command]
+    elif _is_own_script(program):
+        start = [python, str(program.absolute()), command]
+    else:
+        start = [python, str(ROOT / "scripts" / f"{command}.py")]
+    return shlex.join([*start, *(str(part.absolute() if isinstance(part, Path) else part) for part in arguments)])
 
 
 def _is_own_script(program: Path) -> bool:

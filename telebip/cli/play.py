@@ -120,7 +120,13 @@ def _replay(options: argparse.Namespace) -> None:
     action, push = fault.record["action"].tolist(), fault.record["wrench_w"].tolist()
     console.print(f"  action        {' '.join(f'{a:.4g}' for a in action)}")
     console.print(f"  push          {' '.join(f'{p:.4g}' for p in push[:3])} N")
-    console.print("reproduced" if done.reproduces(fault.kind) else f"not reproduced on {backend}")
+    if "reward_terms" in fault.record:
+        terms = zip(fault.config.rewards, fault.record["reward_terms"].tolist(), strict=False)
+        console.print(f"  rewards       {' '.join(f'{name} {value:.4g}' for name, value in terms)}")
+    if fault.kind == "non_finite_reward":  # the physics is repeated, its terms are not
+        console.print("the physics was right; a reward was not finite")
+    else:
+        console.print("reproduced" if done.reproduces(fault.kind) else f"not reproduced on {backend}")
     _show(console, options, [(fault.kind, done.rollout())], done.robot)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from telebip.cli.check import check
-from telebip.cli.common import Parser, check_connect, checked_robot, compare_robot, invocation, open_checkpoint, resolve_device
+from telebip.cli.common import Parser, check_connect, checked_robot, compare_robot, hint, open_checkpoint, resolve_device
 from telebip.config import TaskConfig, load_task, task_names
 from telebip.errors import UserError
 from telebip.viz.opengl import choose_opengl
@@ -175,11 +175,11 @@ def train(
         if walks:
             console.print(f"it walks after {trainer.samples / 1e6:.2f} M samples: {walking and walking.last}")
         if trainer.iteration < total:
-            again = f"{invocation('train')} --resume {trainer.run_dir}"
+            again = hint("train", "--resume", trainer.run_dir)
             console.print(f"stopped after iteration {trainer.iteration} of {total}; go on with: {again}")
         if ranks.is_main and view.record:
             _record(trainer, console)
-    console.print(f"see it walk: {invocation('play')} --checkpoint {trainer.run_dir} --viewer rerun")
+    console.print(f"see it walk: {hint('play', '--checkpoint', trainer.run_dir, '--viewer', 'rerun')}")
     return walks or trainer.iteration >= total
 
 

@@ -13,8 +13,8 @@ from torch import Tensor
 from telebip.math import over
 from telebip.sim.base import ENGINE_FAULTS
 
-KINDS = ("non_finite_action", "non_finite_state", *ENGINE_FAULTS)
-"""Rows of a step's faults (kinds, num_envs): the policy's, the physics', and those that the engine reports itself."""
+KINDS = ("non_finite_action", "non_finite_state", *ENGINE_FAULTS, "non_finite_reward")
+"""Rows of a step's faults (kinds, num_envs): the policy's, the physics', those that the engine reports itself, the rewards'."""
 
 
 class FaultRecorder:
@@ -53,4 +53,12 @@ class FaultRecorder:
         seen = zip(KINDS, self._seen.tolist(), strict=True)
         new = [(row, kind) for row, (kind, is_seen) in enumerate(seen) if is_seen and kind not in self._taken]
         self._taken.update(kind for _, kind in new)
-        return {kind: {name: value[row].cpu().clone() for name, value in self._records.items()} for row, kind in new}
+        return {kind: self._row(row) for row, kind in new}
+
+    def first(self, kind: str) -> dict[str, Any] | None:
+        """Return the first record of a kind, taken or not; None if there is none. Waits for the device."""
+        row = KINDS.index(kind)
+        return self._row(row) if self._seen[row] else None
+
+    def _row(self, row: int) -> dict[str, Any]:
+        return {name: value[row].cpu().clone() for name, value in self._records.items()}
