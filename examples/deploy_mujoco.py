@@ -43,8 +43,13 @@ class Policy:
 
     def __init__(self, file: Path) -> None:
         """Load the network and its description; exit if the policy sees something that is not in `TERMS`."""
-        self._session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
+        try:
+            self._session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
+        except Exception as error:  # onnxruntime's have no common base
+            raise SystemExit(f"{file}: {error}") from error
         texts = self._session.get_modelmeta().custom_metadata_map
+        if "force_range" not in texts:
+            raise SystemExit(f"{file}: no policy exported by this version; export it again")
         self.about = {key: json.loads(text) for key, text in texts.items()}
         self._nominal, self._scale = np.array(self.about["nominal_pose"]), np.array(self.about["action_scale"])
         self._terms = [part["name"] for part in self.about["observation"]]
@@ -99,19 +104,39 @@ class SimulatedRobot:
     """The robot's sensors and motors, in MuJoCo."""
 
     def __init__(self, file: Path, about: dict) -> None:
-        """Stand in the pose `home`, with the gains that the policy was trained with."""
+        """Stand in the pose `home`, with the gains that the policy was trained with; exit if the robot is another one."""
         self.model = mujoco.MjModel.from_xml_path(str(file))
         self.data = mujoco.MjData(self.model)
         self.model.opt.timestep = about["physics_dt"]
-        joints = [self.model.joint(name) for name in about["joint_names"]]
+        if self.model.njnt == 0 or self.model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
+            raise SystemExit(f"{file}: the first joint must be a free joint, that of the trunk")
+        joints = [self._joint(name, file) for name in about["joint_names"]]
         self._qpos, self._qvel = [joint.qposadr[0] for joint in joints], [joint.dofadr[0] for joint in joints]
-        self._motors = [self.model.actuator_trnid[:, 0].tolist().index(joint.id) for joint in joints]
+        self._motors = [self._motor(joint, file) for joint in joints]
         self._substeps = round(about["step_dt"] / about["physics_dt"])
-        for motor, kp, kd, limit in zip(self._motors, about["stiffness"], about["damping"], about["force_limit"], strict=True):
+        for motor, kp, kd, limits in zip(self._motors, about["stiffness"], about["damping"], about["force_range"], strict=True):
+            gear = self.model.actuator_gear[motor, 0]  # gains and limits of the policy are those at the joint
+            self.model.actuator_ctrlrange[motor] = np.sort(self.model.actuator_ctrlrange[motor] / gear)
+            self.model.actuator_gear[motor, 0] = 1.0
             self.model.actuator_gainprm[motor, 0] = kp
-            self.model.actuator_biasprm[motor, 1:3] = -kp, -kd
-            self.model.actuator_forcerange[motor] = -limit, limit
-        mujoco.mj_resetDataKeyframe(self.model, self.data, self.model.key("home").id)
+            self.model.actuator_biasprm[motor, :3] = 0.0, -kp, -kd
+            self.model.actuator_forcelimited[motor], self.model.actuator_forcerange[motor] = True, limits
+        homes = [i for i in range(self.model.nkey) if self.model.key(i).name == "home"]
+        if not homes:
+            raise SystemExit(f"{file}: no keyframe named 'home' to start from")
+        mujoco.mj_resetDataKeyframe(self.model, self.data, homes[0])
+
+    def _joint(self, name: str, file: Path):
+        if mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_JOINT, name) < 0:
+            raise SystemExit(f"{file}: no joint named '{name}', which the policy moves")
+        return self.model.joint(name)
+
+    def _motor(self, joint, file: Path) -> int:
+        on_joint = self.model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
+        motors = np.flatnonzero(on_joint & (self.model.actuator_trnid[:, 0] == joint.id))
+        if not len(motors):
+            raise SystemExit(f"{file}: no actuator moves joint '{joint.name}'")
+        return int(motors[0])
 
     def read(self) -> Readings:
         """Read the true state; the trunk's free joint comes first."""
@@ -175,8 +200,11 @@ def main() -> None:
     parser.add_argument("--duration", type=float, default=20.0, help="s (default: 20)")
     options = parser.parse_args()
 
-    policy = Policy(options.policy)
-    robot = SimulatedRobot(options.model, policy.about)
+    try:
+        policy = Policy(options.policy)
+        robot = SimulatedRobot(options.model, policy.about)
+    except ValueError as error:
+        raise SystemExit(f"{options.model}: {error}") from error
 
     def show(t: float) -> None:
         if t % 2.0 < 0.5 * policy.about["step_dt"]:

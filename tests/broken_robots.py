@@ -57,7 +57,24 @@ def mutate(root: ET.Element, rng: random.Random) -> str:
     element = rng.choice(list(parents))
     names = sorted(element.attrib)
     name = rng.choice(names) if names else ""
-    kind = rng.choice(("drop", "rename", "retype", "scale", "nan", "huge", "swap", "lose", "double"))
+    kind = rng.choice(
+        (
+            "drop",
+            "drop",
+            "rename",
+            "retype",
+            "scale",
+            "scale",
+            "scale",
+            "scale",
+            "nan",
+            "huge",
+            "huge",
+            "swap",
+            "lose",
+            "double",
+        )
+    )
     if kind == "drop":
         parents[element].remove(element)
     elif kind == "double":

@@ -20,6 +20,11 @@ MJCF = (ROOT / "assets/telebip.xml").read_text()
 JOINTS = ("right_hip_roll", "right_hip_pitch", "right_knee", "left_hip_roll", "left_hip_pitch", "left_knee")
 FOLDER = ROOT / "tests" / "robots"
 LEFT_KNEE = '<joint name="left_knee" class="knee"/>'
+POSITION = '<position name="left_knee" joint="left_knee" class="knee"/>'
+GENERAL = (
+    '<general name="left_knee" joint="left_knee" forcerange="-400 400" biastype="affine" gainprm="6000" '
+    'biasprm="0 -6000 -200"/>'
+)
 LEFT_SHANK = '<geom name="left_shank" type="cylinder" size="0.018 0.225" pos="0 0 0.225" mass="0.3"'
 
 
@@ -300,7 +305,9 @@ def test_relative_path_is_found_from_any_working_directory(tmp_path: Path, monke
 
 
 def test_missing_file_is_named() -> None:
-    with pytest.raises(UserError, match=r"^robot file 'assets/telebop\.xml' does not exist$"):
+    with pytest.raises(
+        UserError, match=r"^robot file 'assets/telebop\.xml' does not exist; if it has moved, .* sim\.robot=FILE$"
+    ):
         load_robot("assets/telebop.xml")
 
 
@@ -319,7 +326,6 @@ def test_broken_mjcf_is_one_line_that_names_the_file(tmp_path: Path, text: str) 
     [
         ({'name="right_foot_force"': 'name="right_force"'}, "no sensor named 'right_foot_force'; valid: 'accelerometer'"),
         ({'key name="home"': 'key name="house"'}, "no key named 'home'; valid: 'house'"),
-        ({'body name="trunk"': 'body name="torso"'}, "no body named 'trunk'"),
         ({'geom name="floor"': 'geom name="ground"'}, "no geom named 'floor'"),
         ({'forcerange="-400 400"': ""}, "actuator 'right_knee' needs a forcerange"),
         ({'range="-0.15 0.20" ': ""}, "joint 'right_knee' needs a range"),
@@ -328,7 +334,7 @@ def test_broken_mjcf_is_one_line_that_names_the_file(tmp_path: Path, text: str) 
             {'<position name="left_knee"': '<intvelocity kp="9" actrange="-1 1" name="left_knee"'},
             "'left_knee' must act at once",
         ),
-        ({'<position name="left_knee"': '<position gear="2" name="left_knee"'}, "actuator 'left_knee' must have a gear of 1"),
+        ({'<position name="left_knee"': '<position gear="0" name="left_knee"'}, "actuator 'left_knee' has a gear of 0"),
         ({'name="left_knee" joint="left_knee"': 'name="left_knee" site="imu"'}, "actuator 'left_knee' must drive one joint"),
         ({'joint="left_knee"': 'joint="right_knee"'}, "joint 'right_knee' has a second actuator, 'left_knee'"),
         ({'joint name="right_hip_roll"': 'joint type="ball" range="0 1" name="right_hip_roll"'}, "must be a hinge or a slide"),
@@ -336,8 +342,54 @@ def test_broken_mjcf_is_one_line_that_names_the_file(tmp_path: Path, text: str) 
             {'<touch name="left_foot_force" site': '<accelerometer name="left_foot_force" site'},
             "'left_foot_force' must be a touch",
         ),
-        ({'<body name="trunk"': '<body name="base"', '<body name="right_hip"': '<body name="trunk"'}, "that of body 'trunk'"),
         ({'<freejoint name="root"/>': ""}, "keyframe"),
+        ({"<option ": '<option gravity="0 0 0" '}, "option gravity is '0 0 0'; it must point down"),
+        ({"<option ": '<option gravity="0 -9.81 0" '}, "option gravity is '0 -9.81 0'"),
+        ({"<option ": '<option gravity="0 0 9.81" '}, "option gravity is '0 0 9.81'"),
+        ({'timestep="0.005"': 'timestep="1e-9"'}, "option timestep is 1e-09 s"),
+        ({"<option ": '<option><flag contact="disable"/></option><option '}, "option flag contact is disabled"),
+        ({"<option ": '<option><flag actuation="disable"/></option><option '}, "option flag actuation is disabled"),
+        ({"<option ": '<option actuatorgroupdisable="0" '}, "actuator 'right_hip_roll' is disabled with its group"),
+        ({'forcerange="-400 400"': 'forcerange="-400 0"'}, "actuator 'right_knee' has forcerange \"-400 0\""),
+        ({'forcerange="-400 400"': 'forcerange="10 400"'}, "actuator 'right_knee' has forcerange \"10 400\""),
+        ({'kp="6000"': 'kp="6000" ctrlrange="-0.1 0.02"'}, "actuator 'right_knee' clips targets to ctrlrange \"-0.1 0.02\""),
+        ({POSITION: GENERAL.replace("0 -6000 -200", "0 -6000 5")}, "actuator 'left_knee' has negative damping"),
+        ({POSITION: GENERAL.replace("0 -6000 -200", "30 -6000 -200")}, "actuator 'left_knee' adds the force 30"),
+        ({'joint="left_knee"': 'joint="left_knee" delay="0.01" nsample="3"'}, "actuator 'left_knee' has a delay"),
+        (
+            {'range="-0.15 0.20"': 'range="0.05 0.20"'},
+            "joint 'right_knee' stands at 0.04 in keyframe 'home', outside of its range",
+        ),
+        ({'<freejoint name="root"/>': '<joint type="free" damping="3"/>'}, "the free joint of body 'trunk' has damping 3"),
+        (
+            {'<freejoint name="root"/>': '<joint type="free" armature="0.1"/>'},
+            "the free joint of body 'trunk' has armature 0.1",
+        ),
+        ({'<geom name="floor"': '<geom name="floor" euler="0.1 0 0"'}, "geom 'floor' is tilted"),
+        ({'<geom name="floor"': '<geom name="floor" pos="0 0 -0.2"'}, "geom 'floor' lies at z = -0.2"),
+        (
+            {
+                'force" site="right_foot"': 'force" site="left"',
+                'force" site="left_foot"': 'force" site="right_foot"',
+                'site="left"': 'site="left_foot"',
+            },
+            "sensor 'right_foot_force' is on the left foot",
+        ),
+        (
+            {'force" site="right_foot"': 'force" site="imu"'},
+            "sensor 'right_foot_force' is on site 'imu' of body 'trunk', which is no foot",
+        ),
+        ({'force" site="right_foot"': 'force" site="left_foot"'}, "both feet's sensors are on body 'left_foot'"),
+        (
+            {'contype="2" conaffinity="3" condim': 'contype="4" conaffinity="4" condim'},
+            "no geom of body 'right_foot' collides with geom 'floor'",
+        ),
+        (
+            {'force" site="right_foot"': 'force" cutoff="20" site="right_foot"'},
+            "sensor 'right_foot_force' has a cutoff of 20 N",
+        ),
+        ({'armature="1"': 'armature="nan"'}, "dof_armature of joint 'right_knee' is not finite"),
+        ({'kp="6000"': 'kp="nan"'}, "actuator_gainprm of actuator 'right_knee' is not finite"),
     ],
 )
 def test_mjcf_that_breaks_the_contract_is_refused(tmp_path: Path, edits: dict[str, str], part: str) -> None:

@@ -19,8 +19,7 @@ def dump_new_faults(env: TelebipEnv, task: str, run_dir: Path, note: Note) -> No
     """Write the first fault of each kind to the run's folder, unless an earlier one is there, and tell of it."""
     for kind, record in env.take_faults().items():
         said, file = env.sim.advice.get(kind, ""), fault_file(run_dir, kind)
-        if kind == "non_finite_reward":
-            said = env.broken_reward()
+        where = env.broken_reward() if kind == "non_finite_reward" else describe(record)
         try:
             if file.exists():
                 dumped = f"not dumped, as {file} holds an earlier one"
@@ -28,7 +27,7 @@ def dump_new_faults(env: TelebipEnv, task: str, run_dir: Path, note: Note) -> No
                 dumped = f"dumped, for play --replay {quoted(save_fault(run_dir, kind, record, task, env))}"
         except OSError as error:
             dumped = f"cannot be dumped: {error.strerror or error}"
-        note(f"fault: {kind}, {describe(record)}{f' ({said})' if said else ''}; {dumped}")
+        note(f"fault: {kind}, {where}{f' ({said})' if said else ''}; {dumped}")
 
 
 def quoted(path: Path) -> str:

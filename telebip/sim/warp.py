@@ -4,8 +4,12 @@
 The only file that imports `mujoco_warp`. Torch tensors and Warp arrays share memory in both directions.
 """
 
+import os
+import sys
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import mujoco_warp as mjw
 import torch
@@ -78,6 +82,26 @@ class EngineGraph:
             wp.capture_launch(self._graph, stream=self._streams[stream.cuda_stream])
 
 
+def start_warp() -> None:
+    """Start Warp; where its folder for compiled kernels cannot be written, as in a read-only home, with another one.
+
+    Raises:
+        UserError: that cannot be written either.
+    """
+    try:
+        wp.init()
+        tempfile.TemporaryFile(dir=wp.config.kernel_cache_dir).close()
+    except OSError as error:
+        folder = Path(tempfile.gettempdir()) / f"telebip-warp-{os.getuid() if hasattr(os, 'getuid') else ''}"
+        print(f"note: kernels are kept in {folder}, as '{error.filename}' cannot be written: {error.strerror}", file=sys.stderr)
+        try:
+            folder.mkdir(mode=0o700, exist_ok=True)
+            wp.config.kernel_cache_dir = str(folder)
+            wp.init()
+        except OSError as other:
+            raise UserError(f"backend 'warp' needs a folder for its kernels: {other}; set WARP_CACHE_PATH to one") from other
+
+
 class WarpSimulator:
     """`Simulator` on `mujoco_warp`, float32 throughout."""
 
@@ -110,14 +134,14 @@ class WarpSimulator:
         self._decimation = decimation
         self._derives = derives(model_fields)
         wp.config.log_level = wp.LOG_WARNING  # not a line for each of a hundred kernels
-        wp.init()
+        start_warp()
         self._wp_device = wp.device_from_torch(device)
         per_world = (*model_fields, *(DERIVED if self._derives else ()))
         with wp.ScopedDevice(self._wp_device):
             try:
                 self.mjw_model = mjw.put_model(self.model, batch_sizes=dict.fromkeys(per_world, num_envs))
             except (NotImplementedError, ValueError) as error:
-                raise UserError(f"{robot.path}: backend 'warp': {error}") from error
+                raise UserError(f"{robot.path}: backend 'warp': {error} (--backend native takes it)") from error
             self.mjw_model.opt.warn_overflow = 0  # `faults` has them
             self.mjw_data = mjw.make_data(self.model, nworld=num_envs, nconmax=max_contacts, njmax=max_constraints)
             if deterministic:
