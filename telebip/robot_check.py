@@ -17,6 +17,8 @@ from telebip.errors import UserError
 
 HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+DYNAMICS = tuple(int(kind) for kind in (mujoco.mjtDyn.mjDYN_NONE, mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT))
+"""Of an actuator whose control is where the joint is to go: at once, or through a first-order filter."""
 PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
 NEEDED = ("CONSTRAINT", "CONTACT", "LIMIT", "GRAVITY", "ACTUATION", "SENSOR")
 """What of `<option><flag .../>` must not be disabled."""
@@ -170,18 +172,14 @@ def _drives_joint(model: mujoco.MjModel, i: int) -> bool:
 
 def _not_position(model: mujoco.MjModel, i: int, name: str) -> Iterator[str]:
     """Yield why an actuator's force is not kp (control - position) - kv velocity."""
-    (kp, *_), (offset, stiffness, damping, *_) = model.actuator_gainprm[i], model.actuator_biasprm[i]
+    (kp, *_), (offset, stiffness, *_) = model.actuator_gainprm[i], model.actuator_biasprm[i]
     kinds = (model.actuator_gaintype[i], model.actuator_biastype[i])
     if kinds != (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_AFFINE) or not 0.0 < kp == -stiffness:
         yield f"actuator '{name}' must be a position actuator: its control is a joint target"
     if offset != 0.0:
         yield f"actuator '{name}' adds the force {offset:g} to that of its target; the first number of biasprm must be 0"
-    if damping > 0.0:
-        yield f"actuator '{name}' has negative damping, which drives the joint; kv must not be below 0"
-    if model.actuator_dyntype[i] != mujoco.mjtDyn.mjDYN_NONE:
-        yield f"actuator '{name}' must act at once: no time constant or other activation dynamics"
-    if model.actuator_delay[i] > 0.0:
-        yield f"actuator '{name}' has a delay; leave it out and use the task's actions.physics_delay"
+    if model.actuator_dyntype[i] not in DYNAMICS:
+        yield f"actuator '{name}' must act at once or through a filter (timeconst), not through other activation dynamics"
     if model.actuator_gear[i, 0] == 0.0:
         yield f"actuator '{name}' has a gear of 0 and moves nothing"
     if model.opt.disableactuator >> int(model.actuator_group[i]) & 1:

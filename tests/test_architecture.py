@@ -15,7 +15,7 @@ LAYERS = [
     {"telebip", "telebip.archive", "telebip.errors", "telebip.files", "telebip.graph", "telebip.math"},
     {"telebip.mdp.term"},  # what a term is, which whoever writes one, or checks a task, needs to know
     {"telebip.terrain"},
-    {"telebip.robot", "telebip.robot_record"},
+    {"telebip.robot", "telebip.robot_check", "telebip.robot_record"},
     {"telebip.sim"},
     {"telebip.mdp"},
     {"telebip.config"},
