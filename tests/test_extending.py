@@ -76,7 +76,7 @@ def test_a_script_with_terms_of_its_own_is_telebips_command(tmp_path: Path) -> N
 
     trained = run("train", "--task", "mine.yaml", *TINY)
     (run_dir,) = (tmp_path / "runs" / "mine").iterdir()
-    assert f"see it walk: python mine.py play --checkpoint {run_dir.relative_to(tmp_path)}" in trained.stdout
+    assert f"{tmp_path / 'mine.py'} play --checkpoint {run_dir} --viewer rerun" in trained.stdout
     row = read_curve(run_dir)[-1]
     assert -0.5 < row["reward/level"] < 0.0
     assert row["termination/off_the_track_per_minute"] == 0.0

@@ -354,7 +354,6 @@ def test_broken_mjcf_is_one_line_that_names_the_file(tmp_path: Path, text: str) 
         ({'forcerange="-400 400"': 'forcerange="10 400"'}, "actuator 'right_knee' has forcerange \"10 400\""),
         ({'kp="6000"': 'kp="6000" ctrlrange="-0.1 0.02"'}, "actuator 'right_knee' clips targets to ctrlrange \"-0.1 0.02\""),
         ({POSITION: GENERAL.replace("0 -6000 -200", "30 -6000 -200")}, "actuator 'left_knee' adds the force 30"),
-        ({'joint="left_knee"': 'joint="left_knee" delay="0.01" nsample="3"'}, "actuator 'left_knee' has a delay"),
         (
             {'range="-0.15 0.20"': 'range="0.05 0.20"'},
             "joint 'right_knee' stands at 0.04 in keyframe 'home', outside of its range",

@@ -55,8 +55,8 @@ def test_a_fresh_environment_trains_plays_records_and_exports(wheel: Path, tmp_p
     assert "train a policy" in run("telebip", "--help")
     assert "telebip train --task" in run("telebip", "train", "--help")
     trained = run("telebip", "train", "--task", "telebip_slow", *TINY)
-    assert "see it walk: telebip play --checkpoint runs" in trained
     (run_dir,) = (folder / "runs" / "telebip_slow").iterdir()
+    assert f"telebip play --checkpoint {run_dir} --viewer rerun" in trained
     played = run("telebip", "play", "--checkpoint", str(run_dir), "--duration", "1", "--record", "walk.rrd", "--device", "cpu")
     assert "recorded walk.rrd" in played
     assert (folder / "walk.rrd").stat().st_size > 10_000

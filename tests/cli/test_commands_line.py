@@ -182,7 +182,9 @@ def test_a_policy_is_not_played_on_other_observations_or_joints(tmp_path: Path) 
     other = tmp_path / "left_leg_first.xml"
     sides = {"right": "left", "left": "right"}
     text = (ROOT / "assets" / "telebip.xml").read_text()
-    other.write_text(re.sub("right|left", lambda side: sides[side[0]], text))
+    actuators = re.search("<actuator>.*</actuator>", text, re.DOTALL)
+    assert actuators is not None
+    other.write_text(text.replace(actuators[0], re.sub("right|left", lambda side: sides[side[0]], actuators[0])))
     assert f"was trained on another robot than '{other}'" in refusal(*play, f"sim.robot={other}")
 
 
