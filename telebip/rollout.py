@@ -2,7 +2,7 @@
 
 import dataclasses
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -15,6 +15,9 @@ from torch import Tensor
 from telebip.control.policy import Policy
 from telebip.env import TelebipEnv
 from telebip.errors import UserError
+
+Row = dict[str, Tensor]
+"""One policy step of a `Rollout`: its arrays' rows by their names, (num_envs, ...) each."""
 
 
 class Stride(NamedTuple):
@@ -98,14 +101,24 @@ def roll_out(env: TelebipEnv, policy: Policy, steps: int, progress: Callable[[in
     Raises:
         UserError: the engine had no room for a world's contacts or constraints.
     """
-    rows: list[dict[str, Tensor]] = []
+    rows: list[Row] = []
     walking = walk(env, policy)
     for step in range(steps):
-        command = env.state.target_command.clone()  # a world that ends may get another one
-        stride = next(walking)
-        rows.append({name: value.clone() for name, value in _row(env, stride).items()} | {"command": command})
+        rows.append(next_row(env, walking))
         progress(step + 1)
     judge_faults(env)
+    return as_rollout(env, rows)
+
+
+def next_row(env: TelebipEnv, walking: Iterator[Stride]) -> Row:
+    """Walk on by one policy step, and return a copy of what a rollout keeps of it."""
+    command = env.state.target_command.clone()  # a world that ends may get another one
+    stride = next(walking)
+    return {name: value.clone() for name, value in _row(env, stride).items()} | {"command": command}
+
+
+def as_rollout(env: TelebipEnv, rows: Sequence[Row]) -> Rollout:
+    """Return rows, at least one, as a rollout."""
     arrays = {name: torch.stack([row[name] for row in rows]).cpu().numpy() for name in rows[0]}
     return Rollout(
         step_dt=env.step_dt,
@@ -116,7 +129,7 @@ def roll_out(env: TelebipEnv, policy: Policy, steps: int, progress: Callable[[in
     )
 
 
-def _row(env: TelebipEnv, stride: Stride) -> dict[str, Tensor]:
+def _row(env: TelebipEnv, stride: Stride) -> Row:
     """Return a step's row of the rollout, (num_envs, ...) each, but for the command."""
     sim, state = env.sim.state, env.state
     return {
