@@ -89,6 +89,7 @@ def test_imports_point_one_way(file: Path) -> None:
     [
         ("mujoco_warp", {"telebip.sim.warp", "telebip.tools.engines"}),  # tools measure the engine without the rest
         ("warp", {"telebip.sim.warp", "telebip.sim.ordering", "telebip.tools.engines"}),
+        ("viser", {f"telebip.viz.browser.{name}" for name in ("charts", "scene", "server", "session", "training")}),
         ("rerun", {"telebip.viz.rerun", "telebip.viz.blueprint", "telebip.viz.live"}),
     ],
 )

@@ -209,6 +209,16 @@ def check_connect(options: argparse.Namespace) -> None:
         raise UserError("--connect names a rerun viewer; it goes with --viewer rerun")
 
 
+def check_listen(options: argparse.Namespace) -> None:
+    """Read `--listen`, and refuse it without a `--viewer browser`."""
+    if options.viewer == "browser":
+        from telebip.viz.browser.server import read_address
+
+        options.listen = read_address(options.listen)
+    elif options.listen:
+        raise UserError("--listen says where --viewer browser is served; add that, or leave it out")
+
+
 def check_outputs(json: str | None, plot: str | None) -> None:
     """Refuse files that cannot be written, and plots of unknown endings, now and not after minutes of measuring."""
     if plot and Path(plot).suffix not in (".png", ".svg", ".pdf"):

@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -10,6 +11,7 @@ from telebip.cli.common import (
     CONTROLLERS,
     Parser,
     check_connect,
+    check_listen,
     checked_robot,
     match_robot,
     open_policy,
@@ -24,12 +26,14 @@ from telebip.eval.conditions import as_evaluated
 from telebip.viz.opengl import choose_opengl
 
 AGENTS = ("zero", "random")
+VIEWERS = ("none", "rerun", "mujoco", "browser")
 SUFFIXES = (".rrd", ".mp4", ".gif", ".png")
 EXAMPLES = """\
   play.py --checkpoint assets/policies/telebip_efficient --viewer rerun
   play.py --checkpoint assets/policies/telebip_efficient --record walk.rrd      (then: rerun walk.rrd)
   play.py --checkpoint runs/telebip_flat/2026-01-31_12-00-00 --command 0.7 0 0
   play.py --checkpoint assets/policies/telebip_efficient --viewer mujoco                (steer it: arrow keys, Enter pushes)
+  play.py --checkpoint assets/policies/telebip_efficient --viewer browser               (steer it, here or over ssh)
   play.py --checkpoint assets/policies/telebip_efficient --num-envs 64 --duration 20
   play.py --controller alip --command 0.7 0 0 control.swing_height=0.05    (a model-based walker)
   play.py --checkpoint assets/policies/telebip_efficient --beside alip dcm --record both.mp4
@@ -80,6 +84,8 @@ def _play(options: argparse.Namespace) -> None:
     if checkpoint:
         match_robot(checkpoint, config.sim, robot, is_other)
         _warn_untrained(console, command, checkpoint.config)
+    if options.viewer == "browser":
+        return _steer_in_browser(console, options, robot, checkpoint, overrides, command)
     rollouts = []
     for name in ["RL" if checkpoint else options.controller or options.agent, *options.beside]:
         env = TelebipEnv(with_estimate(config) if name in CONTROLLERS else config, robot, device, options.backend)
@@ -99,6 +105,21 @@ def _play(options: argparse.Namespace) -> None:
         console.print(f"{who}: {task}, {summary.worlds} world{'s' if summary.worlds > 1 else ''} x {summary.duration:g} s")
         console.print(_lines(summary))
     _show(console, options, rollouts, robot)
+
+
+def _steer_in_browser(console, options: argparse.Namespace, robot, checkpoint, overrides, command: Sequence[float]) -> None:
+    """Serve the robots until Ctrl-C."""
+    from telebip.cli.browser import Walkers
+    from telebip.viz.browser.server import serving
+    from telebip.viz.browser.session import Session
+
+    walkers = Walkers(options, checkpoint, overrides, command, _policy)
+    with serving(options.listen, f"telebip: {walkers.chosen}") as (server, address):
+        session = Session(server, robot, walkers.find, walkers.chosen, options.beside)
+        for line in (*address.advice(), "press Ctrl-C to end"):
+            console.print(line)
+        with suppress(KeyboardInterrupt):
+            session.run()
 
 
 def _replay(options: argparse.Namespace) -> None:
@@ -199,7 +220,7 @@ def _warn_untrained(console, command: Sequence[float], trained: TaskConfig) -> N
 
 def _check_replay(parser: Parser, options: argparse.Namespace) -> None:
     """Refuse what cannot change the step of a dumped fault."""
-    if options.viewer == "mujoco":
+    if options.viewer in ("mujoco", "browser"):
         raise UserError("a --replay is five poses; look at them with --viewer rerun or --record")
     for name in ("beside", "command", "disturb", "duration", "num_envs", "seed", "task"):
         if getattr(options, name) != parser.get_default(name):
@@ -225,7 +246,10 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--duration", type=float, default=20.0, metavar="S", help="seconds to walk (default: 20)")
     parser.add_argument("--num-envs", type=int, default=1, metavar="N", help="worlds; they differ in their start (default: 1)")
     parser.add_argument("--disturb", action="store_true", help="keep the task's pushes, friction and observation noise on")
-    parser.add_argument("--viewer", choices=("none", "rerun", "mujoco"), default="none", help="see it at once (default: none)")
+    parser.add_argument(
+        "--viewer", choices=VIEWERS, default="none", help="see it at once; steer it in mujoco and browser (default: none)"
+    )
+    parser.add_argument("--listen", metavar="HOST:PORT", help="of --viewer browser (default: 127.0.0.1:8080)")
     parser.add_argument("--connect", metavar="HOST:PORT", help="a running rerun viewer (default: start one here)")
     parser.add_argument("--record", metavar="FILE", help="write FILE.rrd for the rerun viewer, FILE.mp4, FILE.gif, or FILE.png")
     parser.add_argument("--show", type=int, default=4, metavar="N", help="at most so many worlds, side by side (default: 4)")
@@ -251,8 +275,9 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
             raise UserError(f"--{name.replace('_', '-')} must be at least 1, got {getattr(options, name)}")
     if options.replay:
         _check_replay(parser, options)
-    for name in ("record", "beside"):
-        if options.viewer == "mujoco" and getattr(options, name):
-            raise UserError(f"--viewer mujoco shows one walker, and records nothing; leave out --{name}")
+    for viewer, name in (("mujoco", "record"), ("mujoco", "beside"), ("browser", "record")):
+        if options.viewer == viewer and getattr(options, name):
+            raise UserError(f"--viewer {viewer} leaves no room for --{name}; leave it out")
     check_connect(options)
+    check_listen(options)
     return options

@@ -182,6 +182,11 @@ def _find(given: Path) -> list[Path]:
     raise UserError(f"checkpoint '{given}' does not exist; policies that come with telebip: {shipped}")
 
 
+def checkpoints_in(run_dir: Path) -> list[Path]:
+    """Return a folder's checkpoints: `model_<iteration>.pt`, the newest first, and `policy.pt`, as far as they are there."""
+    return [*_numbered(run_dir).values(), *run_dir.glob("policy.pt")]
+
+
 def _numbered(run_dir: Path) -> dict[int, Path]:
     """Return a run folder's `model_<iteration>.pt` by their iterations, the newest first."""
     files = {int(m[1]): file for file in run_dir.glob("model_*.pt") if (m := re.fullmatch(r"model_(\d+)\.pt", file.name))}

@@ -35,7 +35,7 @@ class Steering:
 
     def restart(self) -> None:
         """Begin anew with the next step, at the first command."""
-        self._restarts = True
+        self._restarts, self.command = True, list(self._start)
 
     def single_step(self) -> None:
         """Walk on for one policy step in spite of a pause."""
@@ -67,7 +67,7 @@ class Steering:
         return as_rollout(self.env, self._rows) if self._rows else None
 
     def _begin(self) -> None:
-        self._restarts, self._push_left, self.falls, self.command = False, 0, 0, list(self._start)
+        self._restarts, self._push_left, self.falls = False, 0, 0
         self.force_w = torch.zeros_like(self.force_w)
         self.env.set_command(*self.command)
         self.env.reset()
