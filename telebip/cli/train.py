@@ -1,15 +1,26 @@
 """`train.py`: train a policy."""
 
 import argparse
+import math
 import signal
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from telebip.cli.check import check
-from telebip.cli.common import Parser, check_connect, checked_robot, compare_robot, hint, open_checkpoint, resolve_device
+from telebip.cli.common import (
+    Parser,
+    check_connect,
+    check_listen,
+    checked_robot,
+    compare_robot,
+    hint,
+    open_checkpoint,
+    resolve_device,
+)
 from telebip.config import TaskConfig, load_task, task_names
 from telebip.errors import UserError
 from telebip.viz.opengl import choose_opengl
@@ -20,6 +31,7 @@ if TYPE_CHECKING:
     from telebip.rl.distributed import Ranks
     from telebip.rl.train import Trainer
     from telebip.sim import Backend
+    from telebip.viz.browser.server import Address
 
 EXAMPLES = """\
   train.py --task telebip_quick --record
@@ -29,9 +41,12 @@ EXAMPLES = """\
   train.py --resume runs/telebip_flat/2026-01-31_12-00-00 --max-iterations 400
   train.py --task robots/mine.yaml --check --picture stand.png    (is the robot fit to be trained?)
   train.py --task telebip_flat --viewer rerun               (curves and robots, live)
+  train.py --task telebip_flat --viewer browser             (the same, and the newest policy can be steered)
   tensorboard --logdir runs
 """
 
+LENGTHS = 60
+"""Iterations in the sparkline of the episodes' length, as a share of the longest."""
 RECORDED = 10.0
 """How long the walk lasts that `--record` records [s]."""
 
@@ -57,6 +72,7 @@ class View:
 
     is_watched: bool = False  # in the rerun viewer, while it goes on
     connect: str | None = None  # address of a running viewer
+    served: "Address | None" = None  # where a browser may watch it and steer its newest policy
     record: bool = False  # whether the policy's walk is recorded at the end
 
 
@@ -68,7 +84,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     start = _resumed(options) if options.resume else _new(options)
     if options.check:
         return check(start.task, start.config, Path(options.picture) if options.picture else None)
-    view = View(options.viewer == "rerun", options.connect, options.record)
+    served = options.listen if options.viewer == "browser" else None
+    view = View(options.viewer == "rerun", options.connect, served, options.record)
     train(start, options.device, options.backend, options.until_walking, view)
 
 
@@ -170,6 +187,8 @@ def train(
             from telebip.viz.live import live_view
 
             report = _both(report, stack.enter_context(live_view(trainer, view.connect)))
+        if view.served and ranks.is_main:
+            report = _both(report, stack.enter_context(_in_browser(trainer, view.served, console)))
         trainer.learn(lambda: asked() or bool(walking and walking.walks()), report)
         walks = bool(walking and walking.walks())
         if walks:
@@ -258,14 +277,23 @@ def _announce(trainer: "Trainer", console: "Console", restart: str) -> None:
     """Print what is trained, how and where."""
     env, size = trainer.env, trainer.ranks.size
     worlds = f"{env.num_envs} worlds" if size == 1 else f"{size} processes x {env.num_envs} worlds"
-    console.print(
-        f"{trainer.task}: {worlds} on {env.device} ({env.sim.backend}), networks in {trainer.arithmetic}, "
-        f"writing to {trainer.run_dir}"
-    )
+    console.print(f"{trainer.task}: {worlds} on {env.device} ({env.sim.backend}), networks in {trainer.arithmetic}")
+    console.print(f"writing to {trainer.run_dir}")
     if trainer.iteration:
         console.print(f"resuming after iteration {trainer.iteration} of {env.cfg.ppo.max_iterations}")
     if restart:
         console.print(f"note: the worlds start new episodes, as {restart}")
+
+
+@contextmanager
+def _in_browser(trainer: "Trainer", address: "Address", console: "Console") -> Iterator[Report]:
+    """Serve the training to browsers, and say where."""
+    from telebip.viz.browser.training import live_session
+
+    with live_session(trainer, address) as (served, report):
+        for line in served.advice():
+            console.print(line)
+        yield report
 
 
 def _both(first: Report, second: Report) -> Report:
@@ -307,12 +335,16 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         "--check", action="store_true", help="train nothing: let the robot stand, and say what is wrong with it"
     )
     parser.add_argument("--picture", metavar="FILE.png", help="with --check, draw it in its home pose and a second later")
-    parser.add_argument("--viewer", choices=("none", "rerun"), default="none", help="watch the training (default: none)")
+    parser.add_argument(
+        "--viewer", choices=("none", "rerun", "browser"), default="none", help="watch the training (default: none)"
+    )
+    parser.add_argument("--listen", metavar="HOST:PORT", help="of --viewer browser (default: 127.0.0.1:8080)")
     parser.add_argument("--connect", metavar="HOST:PORT", help="a running rerun viewer (default: start one here)")
     parser.add_allow_robot_change()
     parser.add_overrides()
     options = parser.parse(argv)
     check_connect(options)
+    check_listen(options)
     if options.allow_robot_change and not options.resume:
         raise UserError("--allow-robot-change goes with --resume: a new run has no other robot")
     if options.picture and not options.check:
@@ -350,36 +382,47 @@ def stop_on_signal(console):
 
 @contextmanager
 def progress_bar(console, trainer, walking=None):
-    """Yield a function that shows an iteration's scalars: a live bar on a terminal, else one line per fiftieth of the run.
+    """Yield a function that shows an iteration's scalars: three live lines on a terminal, else a line per fiftieth of the run.
 
-    Where the training looks whether the policy walks, what it saw last stands beside them.
+    Iteration, time left, whether it walks and the speed error come first, and are whole on 60 columns.
     """
+    from rich.console import Group
+    from rich.live import Live
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.text import Text
 
-    columns = (
-        MofNCompleteColumn(),
-        BarColumn(bar_width=20),
-        TimeElapsedColumn(),
-        TextColumn("eta"),
-        TimeRemainingColumn(),
-        TextColumn("{task.description}"),
-    )
     total = trainer.env.cfg.ppo.max_iterations
-    every = max(1, total // 50)
-    with Progress(*columns, console=console, disable=not console.is_terminal, speed_estimate_period=600) as progress:
-        task = progress.add_task("starting", total=total, completed=trainer.iteration)
+    every, lengths, below = max(1, total // 50), deque(maxlen=LENGTHS), Text("starting", overflow="ellipsis", no_wrap=True)
+    columns = (MofNCompleteColumn(), TextColumn("eta"), TimeRemainingColumn(), BarColumn(20), TimeElapsedColumn())
+    progress = Progress(*columns, console=console, speed_estimate_period=600)
+    task = progress.add_task("", total=total, completed=trainer.iteration)
 
-        def show(scalars: dict[str, float]) -> None:
-            text = (
-                f"{trainer.samples / 1e6:.2f} M samples at {scalars['speed/samples_per_s'] / 1e3:.1f} k/s | "
-                f"return {scalars['train/episode_return']:.1f} | "
-                f"length {scalars['train/episode_length']:.0f}/{trainer.env.max_episode_length} | "
-                f"error {scalars['error/lin_vel_mps']:.2f} m/s | {scalars['walk/falls_per_minute']:.1f} falls/min"
-            )
-            if walking and walking.last:
-                text += f" | last look: {walking.last}"
-            progress.update(task, completed=trainer.iteration, description=text)
-            if not console.is_terminal and (trainer.iteration % every == 0 or trainer.iteration == total):
-                console.print(f"{trainer.iteration:5d}/{total}  {text}", soft_wrap=True)
+    def show(scalars: dict[str, float]) -> None:
+        if math.isfinite(scalars["train/episode_length"]):  # until an episode has ended there is none
+            lengths.append(scalars["train/episode_length"] / trainer.env.max_episode_length)
+        lines = _progress_lines(scalars, trainer, walking)
+        below.plain = "\n".join([*lines, f"length {sparkline(lengths)}"])
+        progress.update(task, completed=trainer.iteration)
+        if not console.is_terminal and (trainer.iteration % every == 0 or trainer.iteration == total):
+            console.print(f"{trainer.iteration:5d}/{total}  {' | '.join(lines)}", soft_wrap=True)
 
+    with Live(Group(progress, below), console=console, refresh_per_second=4) if console.is_terminal else nullcontext():
         yield show
+
+
+def _progress_lines(scalars: dict[str, float], trainer: "Trainer", walking) -> list[str]:
+    """Return what an iteration has brought, in lines of less than 60 characters, as a rule."""
+    lines = [
+        f"error {scalars['error/lin_vel_mps']:.2f} m/s | {scalars['walk/falls_per_minute']:.1f} falls/min | "
+        f"length {scalars['train/episode_length']:.0f}/{trainer.env.max_episode_length}",
+        f"{trainer.samples / 1e6:.2f} M samples at {scalars['speed/samples_per_s'] / 1e3:.1f} k/s | "
+        f"return {scalars['train/episode_return']:.1f}",
+    ]
+    if walking and walking.last:
+        lines.insert(0, f"{'walks' if walking.last.passed else 'not yet'}: {walking.last}")
+    return lines
+
+
+def sparkline(shares: Iterable[float]) -> str:
+    """Return a bar of an eighth to eight eighths for each share from 0 to 1."""
+    return "".join("▁▂▃▄▅▆▇█"[min(7, max(0, int(8.0 * share)))] for share in shares)

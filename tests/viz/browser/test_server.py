@@ -4,12 +4,8 @@ import socket
 import time
 from contextlib import ExitStack
 
-import msgspec
 import pytest
-import viser
-from served import PATIENCE, Served, wait_until
-from websockets import Subprotocol
-from websockets.sync.client import ClientConnection, connect
+from served import PATIENCE, Served, open_tab, wait_until
 
 from telebip.cli.play import main as play
 from telebip.errors import UserError
@@ -41,9 +37,7 @@ def test_a_port_in_use_is_left_to_whoever_has_it() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         assert free(Address("127.0.0.1", port)).port > port
-        with pytest.raises(
-            UserError, match=rf"^port {port} of 127\.0\.0\.1 is in use; \d+ is free: --listen "
-        ):
+        with pytest.raises(UserError, match=rf"^port {port} of 127\.0\.0\.1 is in use; \d+ is free: --listen "):
             free(Address("127.0.0.1", port, is_given=True))
 
 
@@ -67,28 +61,13 @@ def test_listen_goes_with_the_browser_alone() -> None:
         play(["--agent", "zero", "--viewer", "browser", "--record", "walk.rrd"])
 
 
-CAMERA = {
-    "type": "ViewerCameraMessage",
-    **{"wxyz": (1.0, 0.0, 0.0, 0.0), "position": (2.0, 0.0, 1.0), "look_at": (0.0, 0.0, 0.0), "up_direction": (0.0, 0.0, 1.0)},
-    **{"fov": 1.0, "near": 0.01, "far": 100.0, "image_height": 480, "image_width": 640},
-}
-
-
-def open_tab(served: Served) -> ClientConnection:
-    """Connect as a page does, and say where its camera is: from then on it counts as a tab."""
-    protocol = Subprotocol(f"viser-v{viser.__version__}")
-    tab = connect(served.url.replace("http", "ws"), subprotocols=[protocol], max_size=None, max_queue=1)
-    tab.send(msgspec.msgpack.encode(CAMERA))
-    return tab
-
-
 def tabs(served: Served) -> int:
     return len(served.session.server.get_clients())
 
 
 def test_ten_tabs_see_the_same_walk(served: Served) -> None:
     with ExitStack() as stack:
-        opened = [stack.enter_context(open_tab(served)) for _ in range(10)]
+        opened = [stack.enter_context(open_tab(served.url)) for _ in range(10)]
         wait_until(lambda: tabs(served) == 10, "ten tabs are there")
         before = served.steps
         received = [sum(len(tab.recv(timeout=PATIENCE)) for _ in range(10)) for tab in opened]
@@ -98,7 +77,7 @@ def test_ten_tabs_see_the_same_walk(served: Served) -> None:
 
 def test_a_tab_that_does_not_read_holds_up_nobody(served: Served) -> None:
     buffer = served.session.server._websock_server.get_message_buffer()
-    with open_tab(served) as slow, open_tab(served) as other:
+    with open_tab(served.url) as slow, open_tab(served.url) as other:
         wait_until(lambda: tabs(served) == 2, "both tabs are there")
         before = served.steps
         wait_until(lambda: served.steps > before + 50, "the robot walks")
@@ -115,7 +94,7 @@ def test_nothing_moves_while_no_tab_is_open(served: Served) -> None:
     before = served.steps
     time.sleep(1.0)
     assert served.steps == before
-    tab = open_tab(served)
+    tab = open_tab(served.url)
     wait_until(lambda: served.steps > before + 10, "the robot walks")
     tab.socket.shutdown(socket.SHUT_RDWR)  # as where a laptop is shut, without a farewell
     wait_until(lambda: tabs(served) == 0, "it is noticed that the tab has gone")
