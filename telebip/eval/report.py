@@ -3,6 +3,7 @@
 import html
 import json
 import math
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -31,14 +32,19 @@ def write_report(
     tables = [table for table in _tables([*all_results, *references]) if table[2]]
     markdown = [f"# {title}", *([text] if text else [])]
     page = [f"<h1>{html.escape(title)}</h1>", *(f"<p>{html.escape(p)}</p>" for p in text.split("\n\n") if p)]
+    page += [_contents([heading for heading, _, _ in tables])]
+    page += [_section(heading, _html(header, rows)) for heading, header, rows in tables]
+    page += ["<h2 id='plots'>Comparison in plots</h2>"]
     for name, figure in _comparisons(all_results, references):
         picture = plots.svg(figure)
         write(out / f"{name}.svg", picture)
         markdown.append(f"![{name.replace('_', ' ')}]({name}.svg)")
         page.append(f"<figure>{picture}</figure>")
     markdown += [f"## {heading}\n\n{_markdown(header, rows)}" for heading, header, rows in tables]
-    page += [f"<figure>{plots.svg(figure)}</figure>" for figure in _figures_of_each(all_results)]
-    page += [f"<h2>{html.escape(heading)}</h2>{_html(header, rows)}" for heading, header, rows in tables]
+    page += ["<h2 id='walkers'>Each walker alone</h2>"]
+    for results in all_results:
+        figures = "".join(f"<figure>{plots.svg(figure)}</figure>" for figure in _figures_of_each([results]))
+        page += [f"<details><summary>{html.escape(str(results['label']))}</summary>{figures}</details>"] if figures else []
     write(out / "report.md", "\n\n".join(markdown) + "\n")
     write(out / "report.html", _PAGE.format(title=html.escape(title), body="\n".join(page)))
 
@@ -225,6 +231,21 @@ def _html(header: list[str], rows: list[list[str]]) -> str:
     return f"<table><thead>{line(header, 'th')}</thead><tbody>{''.join(line(row, 'td') for row in rows)}</tbody></table>"
 
 
+def _section(heading: str, content: str) -> str:
+    return f"<h2 id='{_anchor(heading)}'>{html.escape(heading)}</h2>{content}"
+
+
+def _contents(headings: Sequence[str]) -> str:
+    """Return the table of contents."""
+    entries = [*((_anchor(heading), heading) for heading in headings), ("plots", "Plots"), ("walkers", "Each walker")]
+    links = [f"<a href='#{anchor}'>{html.escape(text)}</a>" for anchor, text in entries]
+    return f"<nav>{' · '.join(links)}</nav>"
+
+
+def _anchor(heading: str) -> str:
+    return re.sub(r"\W+", "-", heading.lower())
+
+
 def _finite(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _finite(entry) for key, entry in value.items()}
@@ -242,7 +263,15 @@ h1 {{ font-size: 1.7rem; }} h2 {{ font-size: 1.15rem; margin-top: 2rem; }}
 figure {{ margin: 1.2rem 0; }} figure svg {{ max-width: 100%; height: auto; }}
 table {{ border-collapse: collapse; font-size: 0.86rem; display: block; overflow-x: auto; }}
 th, td {{ padding: 0.25rem 0.7rem; text-align: right; border-bottom: 1px solid #e4e6ea; white-space: nowrap; }}
+nav {{ padding: 0.6rem 0; border-block: 1px solid #e4e6ea; }}
+nav a {{ color: #2a5da8; text-decoration: none; white-space: nowrap; }}
+summary {{ cursor: pointer; padding: 0.4rem 0; font-weight: 600; }}
 th:first-child, td:first-child {{ text-align: left; }} th {{ border-bottom: 2px solid #8b9099; white-space: normal; }}
+@media (max-width: 40rem) {{ body {{ margin: 0.5rem auto; }} th, td {{ padding: 0.25rem 0.4rem; }} }}
+@media print {{
+  nav {{ display: none; }} table {{ display: table; overflow: visible; font-size: 0.6rem; }} td {{ white-space: normal; }}
+  figure, tr, h2 {{ break-inside: avoid; }} h2 {{ break-after: avoid; }}
+}}
 </style></head><body>
 {body}
 </body></html>
