@@ -62,6 +62,7 @@ class Policy:
         self._steps = 0
         self._last_action = np.zeros(len(self._nominal))
         self._reference_heading = yaw(readings.quat)
+        self._lag = np.zeros(2)  # how far the robot is behind the commanded velocity, forward and to the left [m]
         self._frames: list[np.ndarray] = []  # the newest first
 
     def joint_targets(self, readings: Readings, command: np.ndarray) -> np.ndarray:
@@ -73,6 +74,7 @@ class Policy:
         """
         if self._steps > 0:
             self._reference_heading += self.about["step_dt"] * command[2]
+            self._advance_lag(readings, command)
         seen, history = self._seen(readings, command), self.about["history"]
         frame = np.concatenate([seen[name] for name in self._terms])
         self._frames = [frame, *(self._frames or [frame] * history)][:history]
@@ -80,6 +82,13 @@ class Policy:
         self._last_action = self._session.run(["actions"], {"obs": obs[None]})[0][0]
         self._steps += 1
         return self._nominal + self._scale * self._last_action
+
+    def _advance_lag(self, readings: Readings, command: np.ndarray) -> None:
+        """Let a step pass on the lag; it counts as far as it changes the command."""
+        gain, limit = self.about["velocity_gain"], self.about["velocity_limit"]
+        if gain:
+            lag = self._lag + self.about["step_dt"] * (command[:2] - readings.lin_vel[:2])
+            self._lag = np.clip(lag, -limit / gain, limit / gain)
 
     def _seen(self, readings: Readings, command: np.ndarray) -> dict[str, np.ndarray]:
         """Return the values of all `TERMS`."""
@@ -95,7 +104,7 @@ class Policy:
             "base_ang_vel": readings.ang_vel,
             "base_quat": relative_to_heading(readings.quat, self._reference_heading),
             "projected_gravity": to_body(np.array([0.0, 0.0, -1.0]), readings.quat),
-            "command": np.array([command[0], command[1], command[2] + correction]),
+            "command": np.array([*(command[:2] + about["velocity_gain"] * self._lag), command[2] + correction]),
             "phase": np.array([phase, -phase]),
         }
 

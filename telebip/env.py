@@ -11,11 +11,11 @@ from torch import Tensor
 
 from telebip.config import TaskConfig, check
 from telebip.graph import CudaGraph
-from telebip.math import wrap_angle, zeros
+from telebip.math import zeros
 from telebip.mdp import log
 from telebip.mdp.actions import DelayLine, joint_targets, scales
 from telebip.mdp.binding import Binder, Events, model_fields_of, sensors_of
-from telebip.mdp.commands import VelocityCommands, hold_heading
+from telebip.mdp.commands import VelocityCommands
 from telebip.mdp.faults import FaultRecorder
 from telebip.mdp.ground import Ground
 from telebip.mdp.groups import Group
@@ -149,6 +149,8 @@ class TelebipEnv(VecEnv):
             forward=cfg.commands.rel_forward_envs,
             heading=cfg.commands.rel_heading_envs,
             heading_stiffness=cfg.commands.heading_control_stiffness,
+            heading_hold=(cfg.commands.heading_gain, cfg.commands.heading_limit),
+            velocity_hold=(cfg.commands.velocity_gain, cfg.commands.velocity_limit),
         )
         self._random = binder.allocate()
         self.state.reset(self._everywhere())  # of what finding the sizes has left
@@ -177,7 +179,7 @@ class TelebipEnv(VecEnv):
         """Give each world its row of `commands` (num_envs, 3) [m/s, m/s, rad/s], for good."""
         self.state.command_is_fixed.fill_(True)
         self.state.target_command.copy_(commands)
-        self._hold_heading(self.view())
+        self._commands.hold(self.view())
 
     def push(self, force_w: Tensor) -> None:
         """Push every trunk's centre of mass with `force_w` (num_envs, 3) or (3,) [N], world frame, until called again."""
@@ -242,10 +244,10 @@ class TelebipEnv(VecEnv):
         state.episode_length += 1
         state.has_begun.fill_(True)
         state.command_timer -= self.step_dt
-        state.reference_heading.copy_(wrap_angle(state.reference_heading + self.step_dt * state.target_command[:, 2]))
+        step = self.view()
+        self._commands.advance(step)
 
         # 2. Terminations. A world with a fault ends its episode like a fall, and is counted by the kind of fault.
-        step = self.view()
         faults = self._find_faults()
         fault = faults.any(0)
         terminations = torch.stack([term(step) for term in self._terminations.values()] or [torch.zeros_like(fault)])
@@ -270,7 +272,7 @@ class TelebipEnv(VecEnv):
         # 4. Reset finished worlds, give new commands where they are due, observe.
         final_obs = {}
         if self._keep_final_obs:
-            self._hold_heading(step)
+            self._commands.hold(step)
             final_obs = self._observe(step)
         self._events.happen("end", step, dones)
         obs = self._observe(self._reset(dones))
@@ -375,14 +377,7 @@ class TelebipEnv(VecEnv):
         step = self.view()
         torch.where(mask, step.heading, reference, out=reference)
         self._commands.update(step)
-        self._hold_heading(step)
         return step
-
-    def _hold_heading(self, step: Step) -> None:
-        """Turn the target command's yaw rate towards the reference heading."""
-        state, cfg = self.state, self.cfg.commands
-        held = hold_heading(state.target_command, step.heading, state.reference_heading, cfg.heading_gain, cfg.heading_limit)
-        state.command.copy_(held)
 
 
 def _copied(value: Any) -> Any:

@@ -20,7 +20,12 @@ NEVER_FALL = "terminations.fallen.min_hip_height=0"
 PHASE, LAST_ACTION = slice(31, 33), slice(12, 18)
 EVENTFUL = (
     *("episode.length=0.3", "commands.resampling_time=0.1", "events.push.interval=[0.06,0.2]"),
-    *("commands.rel_standing_envs=0.1", "commands.rel_forward_envs=0.2", "commands.rel_heading_envs=0.5"),
+    *(
+        "commands.rel_standing_envs=0.1",
+        "commands.rel_forward_envs=0.2",
+        "commands.rel_heading_envs=0.5",
+        "commands.velocity_gain=0.5",
+    ),
     *("events.push.force=150.0", "rewards.energy.k_energy=-0.3", "ppo.max_fault_rate=1.0"),
 )
 """Overrides of a task with which all that the published one has happens within a second."""

@@ -66,6 +66,8 @@ class CommandsConfig:
     heading_control_stiffness: Annotated[float, Quantity("1/s", ge=0)]
     heading_gain: Annotated[float, Quantity("1/s", ge=0)]
     heading_limit: Annotated[float, Quantity("rad/s", ge=0)]
+    velocity_gain: Annotated[float, Quantity("1/s", ge=0)]
+    velocity_limit: Annotated[float, Quantity("m/s", ge=0)]
 
     @property
     def ranges(self) -> tuple[tuple[float, float], ...]:

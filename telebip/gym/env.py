@@ -268,7 +268,8 @@ def observation_space(cfg: TaskConfig, group: Group, actions: Box) -> Box:
     """Return the bounds of an observation, in the order of `observation_names`; what has none is unbounded."""
     command = cfg.commands
     turn = command.heading_limit if command.heading_gain > 0.0 else 0.0
-    ranges = np.array([command.lin_vel_x, command.lin_vel_y, command.ang_vel_z]) + [[0.0, 0.0], [0.0, 0.0], [-turn, turn]]
+    speed = command.velocity_limit if command.velocity_gain > 0.0 else 0.0
+    ranges = np.array(command.ranges) + np.outer([speed, speed, turn], [-1.0, 1.0])
     bounds = {
         "last_action": (actions.low, actions.high),
         "base_quat": (np.array([0.0, -1.0, -1.0, -1.0]), 1.0),

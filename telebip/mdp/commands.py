@@ -1,4 +1,4 @@
-"""The velocity command: when a new one is given and of which kind, and the heading hold."""
+"""The velocity command: when a new one is given and of which kind, and the holds that bend it towards what was commanded."""
 
 import torch
 from torch import Tensor
@@ -9,7 +9,7 @@ from telebip.mdp.step import Step
 
 
 class VelocityCommands:
-    """Gives each world a new command where its last one has expired.
+    """Gives each world a new command where its last one has expired, and holds heading and speed.
 
     A command is uniform in its ranges. A share of them is to march in place, another to walk straight ahead, and another to
     turn to a heading. Each share is drawn by itself; where several hold, the first of these counts.
@@ -25,8 +25,10 @@ class VelocityCommands:
         forward: float = 0.0,
         heading: float = 0.0,
         heading_stiffness: float = 0.0,
+        heading_hold: tuple[float, float] = (0.0, 0.0),
+        velocity_hold: tuple[float, float] = (0.0, 0.0),
     ) -> None:
-        """Make room for the headings.
+        """Make room for the headings, and for how far the robots lag behind.
 
         Args:
             binder: of the worlds.
@@ -36,8 +38,11 @@ class VelocityCommands:
             forward: share of commands that are vx alone, uniform in what of its range is not negative [-].
             heading: share of commands whose yaw rate turns to a heading, uniform in the world, see `turn_to` [-].
             heading_stiffness: k of `turn_to` [1/s].
+            heading_hold: gain [1/s] and limit [rad/s] of `hold_heading`.
+            velocity_hold: gain [1/s] and limit [m/s] of `hold_velocity`.
         """
         self._time, self._stiffness, self._turn_range = resampling_time, heading_stiffness, ranges[2]
+        self._heading_hold, self._velocity_hold = heading_hold, velocity_hold
         self._share = {"standing": standing, "forward": forward, "heading": heading}
         (low, high), share, zero = ranges[0], (0.0, 1.0), binder.step.world.zeros
         drawn = {
@@ -47,7 +52,20 @@ class VelocityCommands:
             "heading": [share, (-torch.pi, torch.pi)] if heading else [],
         }
         self._random = binder.random("commands", drawn)
-        self._memory = binder.memory("commands", {"heading": zero(), "has_heading": zero().bool()}) if heading else {}
+        headings = {"heading": zero(), "has_heading": zero().bool()} if heading else {}
+        lag = {"lag": zero(2)} if velocity_hold[0] else {}
+        self._memory = binder.memory("commands", headings | lag) if headings | lag else {}
+
+    def advance(self, step: Step) -> None:
+        """Let a step pass: the reference heading turns, and a robot that is too slow lags behind."""
+        state, world = step.env, step.world
+        turned = state.reference_heading + world.step_dt * state.target_command[:, 2]
+        state.reference_heading.copy_(wrap_angle(turned))
+        gain, limit = self._velocity_hold
+        if gain:
+            lag = self._memory["lag"]
+            lag += world.step_dt * (state.target_command[:, :2] - step.base_lin_vel_b[:, :2])
+            lag.clamp_(-limit / gain, limit / gain)  # else it would have to be made up for after every change
 
     def update(self, step: Step) -> None:
         """Give new commands where they are due, and let those that have a heading turn to it."""
@@ -55,13 +73,22 @@ class VelocityCommands:
         due = (state.command_timer < 0.5 * step.world.step_dt) & ~state.command_is_fixed
         torch.where(due[:, None], self._draw(), state.target_command, out=state.target_command)
         state.command_timer.masked_fill_(due, self._time)
-        if memory:
+        if "heading" in memory:
             has_heading = self._is_drawn("heading") & ~self._is_drawn("forward") & ~self._is_drawn("standing")
             torch.where(due, self._random["heading"][:, 1], memory["heading"], out=memory["heading"])
             torch.where(due, has_heading, memory["has_heading"], out=memory["has_heading"])
             rate = turn_to(memory["heading"], state.reference_heading, self._stiffness, self._turn_range)
             turns = memory["has_heading"] & ~state.command_is_fixed
             state.target_command[:, 2] = torch.where(turns, rate, state.target_command[:, 2])
+        self.hold(step)
+
+    def hold(self, step: Step) -> None:
+        """Bend the target commands towards the reference heading and the way to go: what the policies see."""
+        state = step.env
+        held = hold_heading(state.target_command, step.heading, state.reference_heading, *self._heading_hold)
+        if "lag" in self._memory:
+            held = hold_velocity(held, self._memory["lag"], *self._velocity_hold)
+        state.command.copy_(held)
 
     def _draw(self) -> Tensor:
         """Return a command for each world from the step's random numbers, (num_envs, 3)."""
@@ -115,3 +142,23 @@ def hold_heading(command: Tensor, heading: Tensor, reference: Tensor, gain: floa
     """
     correction = (gain * wrap_angle(reference - heading)).clamp(-limit, limit)
     return columns(command[:, :2], command[:, 2] + correction)
+
+
+def hold_velocity(command: Tensor, lag: Tensor, gain: float, limit: float) -> Tensor:
+    r"""Add to the commanded velocity what makes up for the way that the robot lags behind.
+
+        v = v_cmd + clip(k e, -limit, limit),    e = integral of (v_cmd - v), body frame, |e| <= limit / k
+
+    A policy that walks a little too slowly lags behind until the correction makes up for it, so that the mean velocity is the
+    commanded one. This is to the velocity what `hold_heading` is to the yaw rate; with k = 0 it is the article's MDP.
+
+    Args:
+        command: (vx, vy, yaw rate) [m/s, m/s, rad/s], (num_envs, 3).
+        lag: e [m], (num_envs, 2).
+        gain: k [1/s].
+        limit: bound of the correction [m/s].
+
+    Returns:
+        The command that the policy sees and is rewarded for, (num_envs, 3).
+    """
+    return columns(command[:, :2] + (gain * lag).clamp(-limit, limit), command[:, 2])

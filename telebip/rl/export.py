@@ -93,6 +93,8 @@ def describe(checkpoint: Checkpoint, robot: Robot) -> dict[str, Any]:
         "command_range": {name: list(getattr(config.commands, name)) for name in ("lin_vel_x", "lin_vel_y", "ang_vel_z")},
         "heading_gain": config.commands.heading_gain,  # 1/s
         "heading_limit": config.commands.heading_limit,  # rad/s
+        "velocity_gain": config.commands.velocity_gain,  # 1/s
+        "velocity_limit": config.commands.velocity_limit,  # m/s
         "iteration": checkpoint.iteration,
         "samples": checkpoint.samples,
         "telebip_version": __version__,

@@ -47,7 +47,7 @@ def untrained(tmp_path: Path) -> Callable[[str, dict, int], Path]:
     """Return a function that exports a policy with random weights for a robot of the tests."""
 
     def make(name: str, terms: dict, history: int = 1) -> Path:
-        task = load_task(str(ROOT / "tests" / "robots" / f"{name}.yaml"), ["num_envs=4"])
+        task = load_task(str(ROOT / "tests" / "robots" / f"{name}.yaml"), ["num_envs=4", "commands.velocity_gain=0.5"])
         task = replace(task, observations={"policy": ObservationGroup(terms, history)})
         export(Trainer(telebip.make(task), name, tmp_path).policy(), tmp_path / "policy.onnx", samples=100)
         return tmp_path / "policy.onnx"

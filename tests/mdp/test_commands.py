@@ -1,4 +1,4 @@
-"""Which commands are given, and how the heading hold bends them."""
+"""Which commands are given, and how the holds bend them."""
 
 import math
 
@@ -9,7 +9,7 @@ from worlds import NEVER_FALL, MakeEnv
 
 from telebip.math import wrap_angle
 from telebip.mdp.binding import Binder
-from telebip.mdp.commands import VelocityCommands, hold_heading, turn_to
+from telebip.mdp.commands import VelocityCommands, hold_heading, hold_velocity, turn_to
 from telebip.mdp.step import Step
 from telebip.robot import Robot
 
@@ -51,6 +51,31 @@ def test_correction_adds_to_the_yaw_rate_alone() -> None:
     # 9 rad is 2.717 rad left of straight ahead, more than the limit.
     torch.testing.assert_close(result, torch.tensor([[0.7, 0.1, 0.3], [-0.5, -0.1, 0.1]]))
     torch.testing.assert_close(command, torch.tensor([[0.7, 0.1, 0.2], [-0.5, -0.1, -0.2]]))
+
+
+def test_velocity_hold_makes_up_for_the_lag_within_its_limit() -> None:
+    command = torch.tensor([[0.7, 0.1, 0.2], [0.7, 0.1, 0.2]])
+    held = hold_velocity(command, torch.tensor([[0.1, -0.04], [1.0, -1.0]]), gain=0.5, limit=0.15)
+    torch.testing.assert_close(held, torch.tensor([[0.75, 0.08, 0.2], [0.85, -0.05, 0.2]]))
+
+
+def test_a_robot_that_stands_lags_behind_as_far_as_counts(make_env: MakeEnv) -> None:
+    hold = ("commands.velocity_gain=0.5", "commands.velocity_limit=0.1", "commands.heading_gain=0")
+    env = make_env(*hold, NEVER_FALL, "episode.length=60", calm=True)
+    env.set_command(0.5, 0.0, 0.0)
+    way = torch.zeros(4, 2)
+    for _ in range(10):
+        env.step(torch.zeros(4, 6))
+        way += 0.02 * (torch.tensor([0.5, 0.0]) - env.view().base_lin_vel_b[:, :2])
+    torch.testing.assert_close(env.state.command[:, :2], torch.tensor([0.5, 0.0]) + 0.5 * way)
+    for _ in range(100):
+        env.step(torch.zeros(4, 6))
+    lag = env.state.memory["commands"]["lag"]
+    assert (lag.abs() <= 0.2 + 1e-6).all()  # 0.1 m/s over 0.5 1/s
+    torch.testing.assert_close(env.state.command[:, :2], torch.tensor([0.5, 0.0]) + 0.5 * lag)
+    env.episode_length_buf = torch.tensor([200, env.max_episode_length - 1, 200, 200])
+    env.step(torch.zeros(4, 6))  # the end of an episode ends its lag
+    assert env.state.memory["commands"]["lag"][1].abs().max() < 0.02
 
 
 @pytest.mark.parametrize(
