@@ -1,6 +1,7 @@
 # pyright: reportAttributeAccessIssue=false, reportOptionalMemberAccess=false
 """MuJoCo's own window, in real time, with keys for the command."""
 
+import math
 import os
 import sys
 import time
@@ -19,9 +20,14 @@ from telebip.viz.scene import PUSH, PUSH_SCALE
 from telebip.viz.steering import Steering
 
 ENTER, BACKSPACE, RIGHT, LEFT, DOWN, UP, SPACE = 257, 259, 262, 263, 264, 265, 32  # GLFW's key codes
+HOME, END = 268, 269
+STEERING = {UP: (0, 1), DOWN: (0, -1), HOME: (1, 1), END: (1, -1), LEFT: (2, 1), RIGHT: (2, -1)}  # number and sign of a step
 STEP = 0.1  # per key press [m/s | rad/s]
 PUSH_FORCE = 60.0  # to the right, and to the left the next time [N]
-KEYS = ("up, down\nleft, right\nEnter\nspace\nBackspace", "faster, slower\nturn\npush\npause\nreset")
+KEYS = (
+    "up, down\nleft, right\nHome, End\nEnter\nspace\nBackspace",
+    "faster, slower\nturn\nstep left, right\npush\npause\nreset",
+)
 
 
 class KeyboardSteering(Steering):
@@ -31,9 +37,9 @@ class KeyboardSteering(Steering):
 
     def press(self, key: int) -> None:
         """Take note of a key that went down; any other is left to the window. Called from the window's thread."""
-        if key in (UP, DOWN, LEFT, RIGHT):
-            i = 0 if key in (UP, DOWN) else 2
-            self.command[i] = round(self.command[i] + (STEP if key in (UP, LEFT) else -STEP), 3)
+        if key in STEERING:
+            i, sign = STEERING[key]
+            self.command[i] = round(self.command[i] + sign * STEP, 3)
         elif key == SPACE:
             self.paused = not self.paused
         elif key == ENTER:
@@ -45,13 +51,13 @@ class KeyboardSteering(Steering):
     def numbers(self) -> tuple[str, str]:
         """Return what is written beside the robot: names, and values over the last second."""
         names, (vx, vy, turn) = "command\nspeed\ncost of transport", self.command
-        speed, moving = 0.0, "-"
+        (ahead, left), moving = (0.0, 0.0), "-"
         if recent := self.recent():
             velocity = heading_velocity(recent.qpos[:, :1], recent.qvel[:, :1])
             cost = cost_of_transport(recent.joint_power[:, :1].sum(-1), velocity, recent.weight)
-            speed = float(velocity[..., 0].mean())
-            moving = f"{cost:.2f}" if abs(speed) > 0.05 else "-"
-        return names, f"{vx:.1f} m/s, {vy:.1f} m/s left, {turn:+.1f} rad/s\n{speed:.2f} m/s forward\n{moving}"
+            ahead, left = velocity.mean((0, 1)).tolist()
+            moving = f"{cost:.2f}" if math.hypot(ahead, left) > 0.05 else "-"
+        return names, f"{vx:.1f} m/s, {vy:.1f} m/s left, {turn:+.1f} rad/s\n{ahead:.2f} m/s, {left:.2f} m/s left\n{moving}"
 
 
 def steer(env: TelebipEnv, policy: Policy) -> None:

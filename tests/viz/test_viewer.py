@@ -9,7 +9,7 @@ from torch import Tensor
 
 from telebip.env import TelebipEnv
 from telebip.errors import UserError
-from telebip.viz.viewer import BACKSPACE, DOWN, ENTER, LEFT, PUSH_FORCE, RIGHT, SPACE, UP, KeyboardSteering, steer
+from telebip.viz.viewer import BACKSPACE, DOWN, END, ENTER, HOME, LEFT, PUSH_FORCE, RIGHT, SPACE, UP, KeyboardSteering, steer
 
 
 class Zero:
@@ -46,10 +46,13 @@ def steering(make_env: Callable[..., TelebipEnv], policy: Zero) -> KeyboardSteer
         ([DOWN], [0.4, 0.0, 0.0]),
         ([LEFT], [0.5, 0.0, 0.1]),
         ([RIGHT, RIGHT, UP], [0.6, 0.0, -0.2]),
+        ([HOME, HOME, LEFT], [0.5, 0.2, 0.1]),
+        ([END], [0.5, -0.1, 0.0]),
+        ([DOWN] * 8, [-0.3, 0.0, 0.0]),  # backward
         ([ord("W")], [0.5, 0.0, 0.0]),
     ],
 )
-def test_arrow_keys_change_the_command(steering: KeyboardSteering, keys: list[int], command: list[float]) -> None:
+def test_keys_change_the_command(steering: KeyboardSteering, keys: list[int], command: list[float]) -> None:
     for key in keys:
         steering.press(key)
     steering.step()
