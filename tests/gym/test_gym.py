@@ -50,6 +50,13 @@ def test_every_task_is_registered() -> None:
     assert env.spec.id == "telebip/Slow-v0"
 
 
+def test_the_omnidirectional_task_has_its_ranges() -> None:
+    seen = make(name="telebip/Omni-v0", num_envs=1).single_observation_space
+    assert isinstance(seen, gymnasium.spaces.Box)
+    assert seen.low[28:31] == pytest.approx([-0.85, -0.6, -1.2], abs=1e-5)  # with the holds' 0.15 m/s and 0.3 rad/s
+    assert seen.high[28:31] == pytest.approx([1.45, 0.6, 1.2], abs=1e-5)
+
+
 def test_a_wrong_override_is_said_in_one_line() -> None:
     with pytest.raises(UserError, match=r"did you mean 'gait.period'"):
         make("gait.perod=1")
