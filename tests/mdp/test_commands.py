@@ -96,10 +96,10 @@ def test_a_heading_command_turns_the_short_way_within_the_range(goal: float, ref
 RANGES = ((-0.6, 1.2), (-0.4, 0.4), (-0.8, 0.8))
 
 
-def drawn(step: Step, **shares: float) -> VelocityCommands:
+def drawn(step: Step, standing: float = 0.0, forward: float = 0.0, heading: float = 0.0) -> VelocityCommands:
     """Commands of worlds that begin, given once."""
     binder = Binder(step)
-    commands = VelocityCommands(binder, RANGES, 5.0, heading_stiffness=1.0, **shares)
+    commands = VelocityCommands(binder, RANGES, 5.0, standing=standing, forward=forward, heading=heading, heading_stiffness=1.0)
     binder.allocate().draw(torch.Generator().manual_seed(0))
     commands.update(step)
     return commands

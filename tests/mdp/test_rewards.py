@@ -74,8 +74,7 @@ def test_tracking_rewards_are_largest_at_the_command() -> None:
 def test_the_mean_over_a_stride_forgives_the_sway_and_not_the_bias(robot: Robot) -> None:
     """Errors of +-0.3 m/s to the side in turn, and always 0.06 m/s too slow, and 0.05 rad/s in turning."""
     step = make_step(robot, gait_period=0.08)  # 4 steps
-    params = {"k_xy": 0.8, "sigma_xy": 0.06, "k_w": 0.2, "sigma_w": 0.05}
-    reward = bind(step, "reward", "stride_cmd", **params)
+    reward = bind(step, "reward", "stride_cmd", k_xy=0.8, sigma_xy=0.06, k_w=0.2, sigma_w=0.05)
     values = []
     for i in range(8):
         step.env.command.copy_(torch.tensor([[0.7, 0.0, 0.05]]))
