@@ -104,7 +104,7 @@ def _play(options: argparse.Namespace) -> None:
         who = checkpoint.path if checkpoint and name == "RL" else f"{'agent' if name in AGENTS else 'controller'} '{name}'"
         console.print(f"{who}: {task}, {summary.worlds} world{'s' if summary.worlds > 1 else ''} x {summary.duration:g} s")
         console.print(_lines(summary))
-    _show(console, options, rollouts, robot)
+    _show(console, options, rollouts, env.robot)
 
 
 def _steer_in_browser(console, options: argparse.Namespace, robot, checkpoint, overrides, command: Sequence[float]) -> None:
@@ -153,9 +153,9 @@ def _replay(options: argparse.Namespace) -> None:
 
 def _show(console, options: argparse.Namespace, rollouts, robot) -> None:
     """Record, film, draw, and open the rerun viewer, as asked."""
-    from telebip.viz.scene import line_up
+    from telebip.viz.scene import LANE, line_up
 
-    actors = line_up(rollouts, worlds=options.show)
+    actors = line_up(rollouts, worlds=options.show, lane=0.0 if robot.terrain else LANE)
     file = Path(options.record) if options.record else None
     if file and file.suffix == ".rrd":
         from telebip.viz.rerun import record

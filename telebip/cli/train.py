@@ -214,19 +214,19 @@ def _record(trainer: "Trainer", console: "Console") -> None:
     from telebip.viz.rerun import record
     from telebip.viz.scene import line_up
 
-    cfg, robot, run_dir = trainer.env.cfg, trainer.env.robot, trainer.run_dir
-    env = TelebipEnv(as_evaluated(cfg, 1, RECORDED), robot, trainer.env.device, trainer.env.sim.backend)
+    cfg, run_dir = trainer.env.cfg, trainer.run_dir
+    env = TelebipEnv(as_evaluated(cfg, 1, RECORDED), trainer.env.robot, trainer.env.device, trainer.env.sim.backend)
     env.set_command(*(0.5 * (low + high) for low, high in cfg.commands.ranges))
     rollout = roll_out(env, load_network(trainer.policy(), env.device), round(RECORDED / env.step_dt))
     actors = line_up([(trainer.task, rollout)])
-    record(actors, robot, run_dir / "walk.rrd")
+    record(actors, env.robot, run_dir / "walk.rrd")
     console.print(f"recorded its walk; look at it with: rerun {run_dir / 'walk.rrd'}")
     curves = learning_curve(run_dir)
     if curves:
         draw_learning(curves, trainer.task).savefig(run_dir / "learning.png", dpi=150)
         console.print(f"drew {run_dir / 'learning.png'}")
     try:
-        strobe(actors[0], robot, run_dir / "walk.png")
+        strobe(actors[0], env.robot, run_dir / "walk.png")
         console.print(f"drew {run_dir / 'walk.png'}")
     except UserError as error:
         console.print(f"note: no picture of it: {error}")

@@ -138,10 +138,34 @@ def log_walks(stream: rr.RecordingStream, actors: Sequence[Actor], robot: Robot,
         if len(actors) > 1:
             above = rr.Points3D([[0.0, 0.0, 0.4]], radii=0.005, colors=[250, 250, 250], labels=[actor.label], show_labels=True)
             stream.log(f"world/{name}/{robot.trunk_name}/label", above, static=True)
+        _log_ground(stream, robot, f"world/{name}/ground", actor)
         _log_links(stream, urdf, robot, f"world/{name}", actor, time)
         _log_arrows(stream, robot, f"world/{name}", actor, time)
         own = PALETTE[i % len(PALETTE)] if len(actors) > 1 else None
         _log_series(stream, plots(actor.rollout, actor.world, robot.is_slide), f"plot/{name}", actor.label, time, own)
+
+
+def _log_ground(stream: rr.RecordingStream, robot: Robot, path: str, actor: Actor, margin: float = 1.5) -> None:
+    """Log the terrain, if there is one, up to `margin` [m] beside the robot's way."""
+    terrain, way = robot.terrain, actor.rollout.qpos[:, actor.world, :2].astype(float)
+    if terrain is None:
+        return
+    rows, columns = terrain.heights.shape
+    low, high = way.min(0) - margin, way.max(0) + margin
+    (left, right), (near, far) = (
+        np.clip(((np.array(ends) + half) / terrain.resolution).round().astype(int), 0, count - 1)
+        for ends, half, count in zip(zip(low, high, strict=True), terrain.half_extent, (columns, rows), strict=True)
+    )
+    x = np.arange(left, right) * terrain.resolution - terrain.half_extent[0]
+    y = np.arange(near, far) * terrain.resolution - terrain.half_extent[1]
+    points = np.stack([*np.meshgrid(x, y), terrain.heights[near:far, left:right]], axis=-1)
+    corner = (np.arange(len(y) - 1)[:, None] * len(x) + np.arange(len(x) - 1)).ravel()
+    faces = np.concatenate([corner[:, None] + [0, 1, len(x) + 1], corner[:, None] + [0, len(x) + 1, len(x)]])
+    shade = (150 + 60 * (points[..., 2:] - points[..., 2].min()) / max(float(np.ptp(points[..., 2])), 0.1)).astype(np.uint8)
+    colors = np.repeat(shade, 3, axis=-1).reshape(-1, 3)
+    stream.log(
+        path, rr.Mesh3D(vertex_positions=points.reshape(-1, 3), triangle_indices=faces, vertex_colors=colors), static=True
+    )
 
 
 def names(actors: Sequence[Actor]) -> list[str]:

@@ -22,10 +22,13 @@ class Actor:
     lane: float = 0.0  # how far it is moved along y [m]
 
 
-def line_up(rollouts: Sequence[tuple[str, Rollout]], worlds: int = 1) -> list[Actor]:
-    """Place the first `worlds` worlds (at most) of every labelled rollout side by side, from left to right, centred."""
+def line_up(rollouts: Sequence[tuple[str, Rollout]], worlds: int = 1, lane: float = LANE) -> list[Actor]:
+    """Place the first `worlds` worlds (at most) of every labelled rollout side by side, from left to right, centred.
+
+    They are `lane` [m] apart; on a terrain, where each walks on its own tile, none.
+    """
     actors = []
     for label, rollout in rollouts:
         count = min(worlds, rollout.qpos.shape[1])
         actors += [Actor(label if count == 1 else f"{label} {world + 1}", rollout, world) for world in range(count)]
-    return [replace(actor, lane=LANE * (0.5 * (len(actors) - 1) - i)) for i, actor in enumerate(actors)]
+    return [replace(actor, lane=lane * (0.5 * (len(actors) - 1) - i)) for i, actor in enumerate(actors)]
