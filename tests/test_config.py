@@ -18,7 +18,7 @@ from telebip.mdp.term import TERMS, Quantity, reward
 FLAT = load_task("telebip_flat")
 CHILDREN = (
     *("telebip_backward", "telebip_efficient", "telebip_fast", "telebip_omni", "telebip_quick", "telebip_robust"),
-    "telebip_slow",
+    *("telebip_rough", "telebip_slow", "telebip_stairs"),
 )
 
 

@@ -178,16 +178,22 @@ def policy_of(checkpoint: "Checkpoint", env: "TelebipEnv", allow_robot_change: b
     return load_policy(checkpoint, env.device)
 
 
-def checked_robot(config: "TaskConfig", is_quiet: bool = False) -> "Robot":
-    """Load a task's robot and let it stand for a second: what is doubtful is said on standard error, a line each.
+def checked_robot(
+    config: "TaskConfig", checkpoint: "Checkpoint | None" = None, allow_robot_change: bool = False, is_quiet: bool = False
+) -> "Robot":
+    """Load a task's robot, compare it with that of a checkpoint, and let it stand for a second.
+
+    What is doubtful is said on standard error, a line each.
 
     Raises:
-        UserError: the robot is no robot that the task can be done with.
+        UserError: the robot is no robot that the task can be done with, or as `match_robot`.
     """
     from telebip.eval.standing import standing_test
     from telebip.robot import load_robot
 
     robot = load_robot(config.sim.robot)
+    if checkpoint:
+        match_robot(checkpoint, config.sim, robot, allow_robot_change)
     findings = standing_test(config, robot)
     refuse_wrong(findings, robot)
     for finding in findings:

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
-from telebip.cli.common import Parser, checked_robot, match_robot, open_checkpoint
+from telebip.cli.common import Parser, checked_robot, open_checkpoint
 from telebip.config import load_task
 from telebip.errors import UserError
 
@@ -41,8 +41,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         from telebip.rl.export import export
     checkpoint = open_checkpoint(options.checkpoint)
     config = load_task(checkpoint.config, options.overrides)
-    robot = checked_robot(config)
-    match_robot(checkpoint, config.sim, robot, options.allow_robot_change)
+    robot = checked_robot(config, checkpoint, options.allow_robot_change)
     checkpoint = dataclasses.replace(checkpoint, config=config, joint_names=list(robot.joint_names))
     with console.status("exporting"):
         difference = export(checkpoint, out, SAMPLES)

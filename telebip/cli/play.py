@@ -13,7 +13,6 @@ from telebip.cli.common import (
     check_connect,
     check_listen,
     checked_robot,
-    match_robot,
     open_policy,
     policy_of,
     resolve_device,
@@ -76,13 +75,12 @@ def _play(options: argparse.Namespace) -> None:
         require_viewer(options.connect)
     device = resolve_device(options.device)
     is_other = options.allow_robot_change
-    robot = checked_robot(config)
+    robot = checked_robot(config, checkpoint, is_other)
     if options.viewer == "rerun" or (options.record and Path(options.record).suffix == ".rrd"):
         from telebip.viz.rerun import drawable
 
         drawable(robot)
     if checkpoint:
-        match_robot(checkpoint, config.sim, robot, is_other)
         _warn_untrained(console, command, checkpoint.config)
     if options.viewer == "browser":
         return _steer_in_browser(console, options, robot, checkpoint, overrides, command)

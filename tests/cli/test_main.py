@@ -12,8 +12,8 @@ from telebip.errors import UserError
 
 
 def test_every_command_is_a_script_and_every_script_a_command() -> None:
-    """Except the one that draws the repository's own pictures."""
-    assert {path.stem for path in ROOT.glob("scripts/*.py")} - {"gallery"} == set(COMMANDS)
+    """Except those that need a checkout: its own pictures, and the check of a GPU, which runs the tests."""
+    assert {path.stem for path in ROOT.glob("scripts/*.py")} - {"gallery", "gpu_check"} == set(COMMANDS)
     for name, module in COMMANDS.items():
         assert module.__name__ == f"telebip.cli.{name}"
         assert f"from {module.__name__} import main" in (ROOT / "scripts" / f"{name}.py").read_text()

@@ -64,7 +64,7 @@ def test_a_broken_world_is_noted_dumped_and_never_learned_from(robot: Robot, tmp
     assert [scalars["fault/engine_warning"] for scalars in training.scalars] == [0.0, 1.0, 0.0]
     assert {file.name for file in (tmp_path / "faults").iterdir()} == {"non_finite_state.pt", "engine_warning.pt"}
     assert len(training.notes) == 2
-    assert training.notes[0].startswith("fault: non_finite_state, world 2, environment step 14; dumped to ")
+    assert training.notes[0].startswith("fault: non_finite_state, world 2, environment step 14; dumped, for play --replay ")
     for scalars in training.scalars:
         assert all(math.isfinite(value) for name, value in scalars.items() if not name.startswith("train/episode"))
 
@@ -75,7 +75,7 @@ def test_a_fault_that_is_not_dumped_as_there_is_one_says_so(robot: Robot, tmp_pa
     second = Training(robot, tmp_path, "ppo.max_iterations=2", "ppo.max_fault_rate=0.05")
     second.trainer.resume(load_checkpoint(tmp_path))
     second.learn(before_step=lambda step: second.break_world(2) if step == 13 else None)
-    assert "step 4; dumped to " in first.notes[0]
+    assert "step 4; dumped, for play --replay " in first.notes[0]
     assert f"step 14; not dumped, as {tmp_path}/faults/non_finite_state.pt holds an earlier one" in second.notes[0]
     assert load_fault(tmp_path / "faults" / "non_finite_state.pt").record["step"] == 4
 

@@ -158,7 +158,10 @@ def test_commands_say_what_differs_and_refuse_what_cannot_be_meant(
 
 
 def test_renamed_joints_go_on_if_told_to(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "left_leg_first.xml").write_text(re.sub("right|left", lambda side: SIDES[side[0]], MJCF.read_text()))
+    swapped = re.sub("right|left", lambda side: SIDES[side[0]], MJCF.read_text())
+    places = {'pos="0 -0.1 0"': 'pos="0 0.1 0"', 'pos="0 0.1 0"': 'pos="0 -0.1 0"'}  # legs stand on the side of their name
+    swapped = re.sub("|".join(places), lambda place: places[place[0]], swapped)
+    (tmp_path / "left_leg_first.xml").write_text(swapped)
     call = [*arguments("play", tmp_path), f"sim.robot={tmp_path / 'left_leg_first.xml'}"]
     with pytest.raises(UserError, match=r"it moves the joints .*; go on with --allow-robot-change$"):
         play.main(call)
