@@ -1,5 +1,8 @@
 """The policies that come with the repository walk as docs/results.md says."""
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -8,12 +11,14 @@ from worlds import CALM
 from telebip import ROOT
 from telebip.config import load_task
 from telebip.env import TelebipEnv
+from telebip.eval.conditions import as_evaluated, on_flat_ground
 from telebip.eval.walk import summarise
 from telebip.rl.checkpoint import load_checkpoint
 from telebip.rl.curve import read_curve
 from telebip.rl.policy import load_policy
 from telebip.robot import Robot
 from telebip.rollout import Rollout, roll_out
+from telebip.rollout import walk as walking
 from telebip.sim import Backend
 
 SPEEDS = (0.5, 0.7, 1.0)  # m/s
@@ -25,6 +30,7 @@ OTHERS = {
     "telebip_slow": (0.7, 0.662),
     "telebip_fast": (1.0, 0.998),
     "telebip_backward": (-0.3, -0.334),
+    "telebip_rough": (0.7, 0.672),
 }
 """Commanded and published mean speed [m/s]."""
 
@@ -34,7 +40,9 @@ def walk(
 ) -> Rollout:
     """Walk `worlds` of a shipped policy at each speed, without disturbances and from random initial velocities."""
     checkpoint = load_checkpoint(ROOT / "assets" / "policies" / policy)
-    config = load_task(checkpoint.config, [f"num_envs={len(speeds) * worlds}", f"episode.length={seconds + 1}", *CALM])
+    config = load_task(
+        on_flat_ground(checkpoint.config), [f"num_envs={len(speeds) * worlds}", f"episode.length={seconds + 1}", *CALM]
+    )
     env = TelebipEnv(config, robot, "cpu", backend)
     env.set_commands(torch.tensor([[speed, 0.0, 0.0] for speed in speeds]).repeat_interleave(worlds, dim=0))
     return roll_out(env, load_policy(checkpoint, "cpu"), round(seconds / env.step_dt))
@@ -60,7 +68,7 @@ def test_the_others_walk_as_fast_as_published(robot: Robot, policy: str) -> None
     summary = summarise(walk(robot, command, worlds=4, seconds=8.0, policy=policy), skip=4.0)
     assert summary.falls == 0
     assert summary.speed[0] == pytest.approx(published, rel=0.03)
-    assert summary.gait_period == pytest.approx(0.6 if policy == "period_06" else 0.5, rel=0.02)
+    assert summary.gait_period == pytest.approx(0.6 if policy in ("period_06", "telebip_rough") else 0.5, rel=0.02)
 
 
 @pytest.mark.parametrize("policy", [name for name in OTHERS if name.startswith("telebip_")])
@@ -73,6 +81,28 @@ def test_their_learning_curves_are_whole(policy: str) -> None:
     curve = read_curve(ROOT / "assets" / "policies" / policy)
     assert [row["iteration"] for row in curve] == list(range(1, len(curve) + 1))
     assert curve[-1]["samples"] == pytest.approx(load_checkpoint(policy).samples, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "params"),
+    [
+        ("boxes", {"height": (0.1, 0.1), "width": 0.4}),
+        ("slope_up", {"angle": (0.35, 0.35)}),
+        ("waves", {"height": (0.1, 0.1), "length": 1.0}),
+    ],
+)
+def test_telebip_rough_leaves_its_tile_on_foot(robot: Robot, name: str, params: dict[str, Any]) -> None:
+    """Boxes and waves of 10 cm, and 20 degrees up: 3 m to the edge take 6 s."""
+    checkpoint = load_checkpoint("telebip_rough")
+    terrain = replace(checkpoint.config.terrain, types={name: params}, levels=1, start_level=(0, 0))
+    env = TelebipEnv(as_evaluated(replace(checkpoint.config, terrain=terrain), 16, 10.0), robot)
+    env.set_command(0.5, 0.0, 0.0)
+    left, fell = np.zeros(16, bool), np.zeros(16, bool)
+    for _, stride in zip(range(375), walking(env, load_policy(checkpoint, "cpu")), strict=False):
+        time_outs = stride.extras["time_outs"].numpy()
+        fell |= stride.dones.numpy() & ~time_outs & ~left
+        left |= time_outs & ~fell
+    assert left.sum() >= 15
 
 
 def test_its_feet_take_turns(robot: Robot) -> None:
@@ -101,6 +131,6 @@ def test_sixty_four_worlds_walk_twenty_seconds(robot: Robot, speed: float) -> No
     assert summary.gait_period == pytest.approx(0.5, rel=0.02)
 
 
-def test_it_was_trained_on_the_published_task() -> None:
-    trained, published = load_checkpoint(ROOT / "assets" / "policies" / "telebip_flat").config, load_task("telebip_flat")
-    assert trained == published
+@pytest.mark.parametrize("policy", ["telebip_flat", "telebip_rough"])
+def test_they_were_trained_on_the_published_tasks(policy: str) -> None:
+    assert load_checkpoint(policy).config == load_task(policy)

@@ -2,6 +2,7 @@
 """The ground: what tiles look like, that the engines' surface is what is computed, and how robots start on it and leave it."""
 
 import math
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -12,11 +13,12 @@ import pytest
 import torch
 from worlds import NEVER_FALL, ROUGH, MakeEnv, random_actions, same
 
+from telebip import ROOT
 from telebip.config import load_task
 from telebip.env import TelebipEnv
 from telebip.errors import UserError
 from telebip.mdp.ground import Ground
-from telebip.mdp.term import find
+from telebip.mdp.term import TERMS, find
 from telebip.robot import Robot
 from telebip.terrain import Terrain, TerrainConfig, Tile
 
@@ -241,3 +243,19 @@ def test_tracking_is_measured_on_flat_ground(robot: Robot) -> None:
     env = TelebipEnv(config, robot.on(Terrain(of(boxes=HEIGHT | {"width": 0.2}))))
     assert env.world.ground is None
     assert env.robot.model.geom("floor").type[0] == mujoco.mjtGeom.mjGEOM_PLANE
+
+
+def test_the_type_of_terrain_in_the_documentation_works() -> None:
+    text = (ROOT / "docs" / "terrain.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
+    exec(code, {"__name__": "mine"})
+    try:
+        config = load_task(
+            "telebip_flat", ["terrain.types.ridge={height: [0.1, 0.2]}", "terrain.levels=2", "terrain.start_level=[0,1]"]
+        )
+        heights = Terrain(config.terrain).heights
+        margin, n = 20, 120
+        easy, hard = heights[margin:-margin, margin : margin + n], heights[margin:-margin, margin + n : margin + 2 * n]
+        assert (np.ptp(easy), np.ptp(hard)) == pytest.approx((0.1, 0.2))
+    finally:
+        del TERMS["terrain"]["ridge"]
