@@ -186,7 +186,11 @@ def terrain(results: Results) -> Figure:
             vmax=1.0,
         )
         for k, row in enumerate(of_kind):
-            axes.text(k, i, f"{100.0 * row['success']:.0f} %\n{obstacle(row)}", ha="center", va="center", fontsize=6.5)
+            text, ink = (
+                f"{100.0 * row['success']:.0f} %\n{obstacle(row)}",
+                "white" if abs(row["success"] - 0.5) > 0.35 else "black",
+            )
+            axes.text(k, i, text, color=ink, ha="center", va="center", fontsize=6.5)
     axes.set_yticks(range(len(kinds)), [kind.replace("_", " ") for kind in kinds])
     axes.set(xlim=(-0.5, len(rows) / len(kinds) - 0.5), ylim=(len(kinds) - 0.5, -0.5), xticks=[])
     axes.grid(visible=False)
@@ -196,7 +200,7 @@ def terrain(results: Results) -> Figure:
 
 def obstacle(row: Mapping[str, Any]) -> str:
     """Return the size of a level's obstacles as people say it: "12 cm", "7.5°"."""
-    return f"{np.degrees(row['size']):g}°" if row["unit"] == "rad" else f"{100.0 * row['size']:g} cm"
+    return f"{np.degrees(row['size']):.3g}°" if row["unit"] == "rad" else f"{100.0 * row['size']:.3g} cm"
 
 
 @rc_context(STYLE)

@@ -4,6 +4,7 @@
 import copy
 import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -15,12 +16,14 @@ from torch import Tensor
 from worlds import write_stateful
 
 from telebip import ROOT
+from telebip.config import load_task
 from telebip.errors import UserError
-from telebip.robot import FOOT_SENSORS, Robot, load_robot
+from telebip.robot import FEET, FLOOR, FOOT_SENSORS, Robot, load_robot
 from telebip.sim import Backend, SimState, Simulator, make_simulator
 from telebip.sim.base import state_fields
 from telebip.sim.native import NativeSimulator
 from telebip.sim.warp import WarpSimulator
+from telebip.terrain import Terrain
 
 Arrays = Mapping[str, NDArray[np.floating]]
 Make = Callable[..., Simulator]
@@ -197,6 +200,51 @@ def test_native_is_bit_identical_inside_for_any_number_of_threads(num_threads: i
     assert_conform(run(sim, targets, wrenches), expected, exact=True)
     np.testing.assert_array_equal(sim.memory["qpos"].numpy(), expected["qpos"][-1])
     np.testing.assert_array_equal(sim.memory["qvel"].numpy(), expected["qvel"][-1])
+
+
+def ground_force(model: mujoco.MjModel, data: mujoco.MjData) -> list[float]:
+    """Vertical force of the ground on the right and the left foot [N], contact by contact."""
+    force, out = np.zeros(6), [0.0, 0.0]
+    for i, contact in enumerate(data.contact[: data.ncon]):
+        for k, foot in enumerate(FEET):
+            if model.geom(foot).id in contact.geom and model.geom(FLOOR).id in contact.geom:
+                mujoco.mj_contactForce(model, data, i, force)
+                upward = 1.0 if contact.geom[0] == model.geom(FLOOR).id else -1.0
+                out[k] += upward * float(contact.frame.reshape(3, 3).T[2] @ force[:3])
+    return out
+
+
+def test_on_rough_ground(make: Make, backend: tuple[Backend, str], robot: Robot) -> None:
+    """`native` equals `mj_step`, bit for bit. `warp` finds other contacts: at most four a foot, and at edges elsewhere."""
+    waves = {"waves": {"height": (0.1, 0.1), "length": 0.5}}
+    terrain = replace(load_task("telebip_flat").terrain, types=waves, levels=1, start_level=(0, 0), size=2.0, platform=0.1)
+    rough = robot.on(Terrain(terrain))
+    steps, qpos = 10, home(rough, NUM_ENVS)
+    qpos[:, :2] += torch.linspace(-0.5, 0.5, NUM_ENVS)[:, None]
+    qpos[:, 2] += 0.05
+    targets, wrenches = random_inputs(rough, NUM_ENVS, steps)
+    sim = make(robot=rough)
+    overwrite(sim, list(range(NUM_ENVS)), qpos, rest(rough, NUM_ENVS))
+    actual = run(sim, targets, wrenches)
+    ends, feet = np.zeros((steps, NUM_ENVS, rough.model.nq)), np.zeros((steps, NUM_ENVS, 2))
+    for world in range(NUM_ENVS):
+        data = mujoco.MjData(rough.model)
+        data.qpos[:] = qpos[world]
+        for step in range(steps):
+            data.ctrl[:], data.xfrc_applied[rough.trunk_id] = targets[step, world], wrenches[step, world]
+            for _ in range(DECIMATION):
+                mujoco.mj_step(rough.model, data)
+                feet[step, world] += np.array(ground_force(rough.model, data)) / DECIMATION
+            ends[step, world] = data.qpos
+    assert feet.max() > 100.0 and np.ptp(ends[-1, :, 2]) > 0.02
+    assert not sim.faults.any()
+    if backend[0] == "native":
+        np.testing.assert_array_equal(actual["qpos"], ends.astype(np.float32))
+        np.testing.assert_allclose(actual["foot_force"], feet, atol=1e-3)
+    else:
+        np.testing.assert_allclose(actual["qpos"][0], ends[0], atol=2e-5)  # in the air
+        np.testing.assert_allclose(actual["qpos"], ends, atol=0.05)  # twice the largest difference seen
+        assert actual["foot_force"].sum() == pytest.approx(feet.sum(), rel=0.02)  # the robots are carried all the same
 
 
 def test_sensors_are_those_of_the_last_physics_step(make: Make, backend: tuple[Backend, str], robot: Robot) -> None:
