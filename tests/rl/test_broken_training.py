@@ -13,6 +13,8 @@ from torch import Tensor
 from telebip.config import load_task
 from telebip.env import TelebipEnv
 from telebip.errors import UserError
+from telebip.mdp.step import Step
+from telebip.mdp.term import TERMS, reward
 from telebip.replay import load_fault
 from telebip.rl.checkpoint import load_checkpoint
 from telebip.rl.train import Trainer
@@ -203,3 +205,19 @@ def test_training_is_the_same_for_any_number_of_physics_threads(robot: Robot, tm
     for policy, qpos in weights[1:]:
         assert all(torch.equal(policy[name], value) for name, value in weights[0][0].items())
         assert torch.equal(qpos, weights[0][1])
+
+
+def test_a_reward_that_is_not_finite_names_its_term_and_world(robot: Robot, tmp_path: Path) -> None:
+    @reward
+    def breaks(step: Step) -> Tensor:
+        """Not a number in world 5 from its fourth step on."""
+        return torch.where((torch.arange(8) == 5) & (step.env.num_steps > 3), math.nan, 0.1)
+
+    try:
+        training = Training(robot, tmp_path, "rewards.breaks={}", "ppo.max_iterations=3", "ppo.max_fault_rate=0.05")
+        with pytest.raises(UserError) as error:
+            training.learn()
+    finally:
+        del TERMS["reward"]["breaks"]
+    assert "reward 'breaks' is nan in world 5, environment step 4" in str(error.value)
+    assert "learning_rate" not in str(error.value)
