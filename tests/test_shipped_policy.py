@@ -31,8 +31,11 @@ OTHERS = {
     "telebip_fast": (1.0, 0.998),
     "telebip_backward": (-0.3, -0.334),
     "telebip_rough": (0.7, 0.672),
+    "telebip_stairs": (0.7, 0.718),
 }
 """Commanded and published mean speed [m/s]."""
+SLOW = ("period_06", "telebip_rough", "telebip_stairs")
+"""Those with a gait period of 0.6 s; the others have 0.5 s."""
 
 
 def walk(
@@ -68,7 +71,7 @@ def test_the_others_walk_as_fast_as_published(robot: Robot, policy: str) -> None
     summary = summarise(walk(robot, command, worlds=4, seconds=8.0, policy=policy), skip=4.0)
     assert summary.falls == 0
     assert summary.speed[0] == pytest.approx(published, rel=0.03)
-    assert summary.gait_period == pytest.approx(0.6 if policy in ("period_06", "telebip_rough") else 0.5, rel=0.02)
+    assert summary.gait_period == pytest.approx(0.6 if policy in SLOW else 0.5, rel=0.02)
 
 
 @pytest.mark.parametrize("policy", [name for name in OTHERS if name.startswith("telebip_")])
@@ -84,16 +87,20 @@ def test_their_learning_curves_are_whole(policy: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "params"),
+    ("policy", "name", "params"),
     [
-        ("boxes", {"height": (0.1, 0.1), "width": 0.4}),
-        ("slope_up", {"angle": (0.35, 0.35)}),
-        ("waves", {"height": (0.1, 0.1), "length": 1.0}),
+        ("telebip_rough", "boxes", {"height": (0.1, 0.1), "width": 0.4}),
+        ("telebip_rough", "slope_up", {"angle": (0.35, 0.35)}),
+        ("telebip_rough", "waves", {"height": (0.1, 0.1), "length": 1.0}),
+        ("telebip_stairs", "stairs_up", {"rise": (0.08, 0.08), "tread": 0.3}),
+        ("telebip_stairs", "boxes", {"height": (0.16, 0.16), "width": 0.4}),
     ],
 )
-def test_telebip_rough_leaves_its_tile_on_foot(robot: Robot, name: str, params: dict[str, Any]) -> None:
-    """Boxes and waves of 10 cm, and 20 degrees up: 3 m to the edge take 6 s."""
-    checkpoint = load_checkpoint("telebip_rough")
+def test_policies_for_rough_ground_leave_their_tile_on_foot(
+    robot: Robot, policy: str, name: str, params: dict[str, Any]
+) -> None:
+    """At 0.5 m/s, 3 m to the edge take 6 s."""
+    checkpoint = load_checkpoint(policy)
     terrain = replace(checkpoint.config.terrain, types={name: params}, levels=1, start_level=(0, 0))
     env = TelebipEnv(as_evaluated(replace(checkpoint.config, terrain=terrain), 16, 10.0), robot)
     env.set_command(0.5, 0.0, 0.0)
@@ -131,6 +138,6 @@ def test_sixty_four_worlds_walk_twenty_seconds(robot: Robot, speed: float) -> No
     assert summary.gait_period == pytest.approx(0.5, rel=0.02)
 
 
-@pytest.mark.parametrize("policy", ["telebip_flat", "telebip_rough"])
+@pytest.mark.parametrize("policy", ["telebip_flat", "telebip_rough", "telebip_stairs"])
 def test_they_were_trained_on_the_published_tasks(policy: str) -> None:
     assert load_checkpoint(policy).config == load_task(policy)

@@ -17,8 +17,8 @@ EXAMPLES = """\
   evaluate.py --checkpoint assets/policies/telebip_efficient --out report
   evaluate.py --checkpoint runs/telebip_flat/2026-01-31_12-00-00 --suite tracking,gait
   evaluate.py --checkpoint assets/policies/telebip_flat --suite push --max-force 150
-  evaluate.py --checkpoint assets/policies/telebip_omni --suite omni
-  evaluate.py --checkpoint assets/policies/telebip_rough --suite tracking,terrain
+  evaluate.py --checkpoint assets/policies/telebip_efficient --suite omni
+  evaluate.py --checkpoint assets/policies/telebip_stairs --suite tracking,terrain
   evaluate.py --controller dcm control.step_time=0.2 sim.decimation=1
   evaluate.py --controller alip --suite tracking --commands=-0.3,0.5        (with = before a negative number)
 """
