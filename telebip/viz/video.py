@@ -69,7 +69,8 @@ def _pictures(actors: Sequence[Actor], robot: Robot, rows: NDArray[np.integer], 
     several, width = len(actors) > 1, LANE * (len(actors) - 1)
     with Renderer(robot, size, extent=1.7 + width) as renderer:
         for row in rows:
-            renderer.look_at([*path[row], 0.42], 1.7 + 0.6 * width, azimuth=125.0, elevation=-12.0)
+            ground = path[row][2] - robot.home_qpos[2] if robot.terrain else 0.0
+            renderer.look_at([*path[row][:2], ground + 0.42], 1.7 + 0.6 * width, azimuth=125.0, elevation=-12.0)
             poses = [_in_lane(actor, row) for actor in actors]
             feet = renderer.place(poses)
             for actor, qpos, soles in zip(actors, poses, feet, strict=True):
@@ -82,8 +83,8 @@ def _pictures(actors: Sequence[Actor], robot: Robot, rows: NDArray[np.integer], 
 
 
 def camera_path(actors: Sequence[Actor], seconds: float = 0.5) -> Array:
-    """Return where the camera looks: the middle of the robots on the ground [m], (steps, 2), means over `seconds`."""
-    places = np.mean([actor.rollout.qpos[:, actor.world, :2] + [0.0, actor.lane] for actor in actors], axis=0)
+    """Return where the camera follows: the middle of the robots' trunks [m], (steps, 3), means over `seconds`."""
+    places = np.mean([actor.rollout.qpos[:, actor.world, :3] + [0.0, actor.lane, 0.0] for actor in actors], axis=0)
     half = max(1, round(0.5 * seconds / actors[0].rollout.step_dt))
     sums, row = np.pad(np.cumsum(places, axis=0, dtype=float), ((1, 0), (0, 0))), np.arange(len(places))
     reach = np.minimum(half, np.minimum(row, len(places) - 1 - row))  # a window that stays centred up to the ends
