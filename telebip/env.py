@@ -23,7 +23,7 @@ from telebip.mdp.step import EnvState, Step, World
 from telebip.mdp.terminations import non_finite
 from telebip.robot import Robot
 from telebip.sim import Backend, indexed, make_simulator
-from telebip.terrain import Terrain
+from telebip.terrain import make_terrain
 
 
 class Outcome(NamedTuple):
@@ -67,7 +67,7 @@ class TelebipEnv(VecEnv):
             UserError: a term does not fit the robot.
         """
         self.cfg: TaskConfig = check(cfg)
-        self.robot = robot.on(Terrain(cfg.terrain) if cfg.terrain.types else None)
+        self.robot = robot.on(make_terrain(cfg.terrain))
         self.device: torch.device = indexed(torch.device(device))
         self.num_envs, self.num_actions = cfg.num_envs, len(robot.joint_names)
         self._keep_final_obs = keep_final_obs

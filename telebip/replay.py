@@ -18,6 +18,7 @@ from telebip.robot import Robot, load_robot
 from telebip.robot_record import describe_robot, differences, is_record
 from telebip.rollout import Rollout
 from telebip.sim import Backend, SimState, Simulator, make_simulator
+from telebip.terrain import make_terrain
 
 FORMAT = "telebip-fault-2"
 RECORD = {"step", "world", "action", "targets", "wrench_w"}
@@ -141,7 +142,7 @@ def replay(fault: Fault, backend: Backend | None = None) -> Replay:
         UserError: the configuration names another robot.
     """
     cfg, record = fault.config, fault.record
-    robot = load_robot(cfg.sim.robot)
+    robot = load_robot(cfg.sim.robot).on(make_terrain(cfg.terrain))
     sim = _simulator_at(fault, robot, backend or fault.backend)
     targets = record["targets"].expand(cfg.sim.decimation, -1)
     seen = set() if record["action"].isfinite().all() else {"non_finite_action"}

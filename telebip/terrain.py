@@ -132,6 +132,11 @@ def gaps(
     return np.where((tile.distance > 0.5 * spacing) & (across < tile.at(width)), -depth, 0.0)
 
 
+def make_terrain(cfg: TerrainConfig) -> "Terrain | None":
+    """Return a task's terrain, or None if it is the floor of the MJCF."""
+    return Terrain(cfg) if cfg.types else None
+
+
 class Terrain:
     """The height field. Its middle is at the world's origin; rows of levels lie along x and columns of types along y."""
 

@@ -176,6 +176,18 @@ def test_a_healthy_step_replays_bit_for_bit(make_env: MakeEnv, tmp_path: Path, o
     assert again.rollout().joint_target.shape == (1 + env.cfg.sim.decimation, 1, 6)
 
 
+def test_a_step_on_rough_ground_is_repeated_on_that_ground(make_env: MakeEnv, tmp_path: Path) -> None:
+    ground = ("terrain.types.slope_down={angle: [0.3, 0.3]}", "sim.max_contacts=16")  # robots stand 0.8 m above a floor
+    env = make_env(NEVER_FALL, *ground, num_envs=NUM_ENVS, calm=True)
+    for _ in range(5):
+        env.step(torch.zeros(NUM_ENVS, 6))
+    assert env.sim.state.foot_force[BAD].sum() > 50.0
+    env.step(break_action(env, torch.zeros(NUM_ENVS, 6)))
+    again = replay(load_fault(save_fault(tmp_path, "non_finite_action", env.take_faults()["non_finite_action"], "t", env)))
+    assert again.robot.terrain is not None
+    assert again.states[-1]["foot_force"].sum() > 50.0
+
+
 def test_only_the_first_fault_of_a_kind_is_kept(make_env: MakeEnv, tmp_path: Path) -> None:
     env = make_env(num_envs=NUM_ENVS)
     zeros = torch.zeros(NUM_ENVS, 6)

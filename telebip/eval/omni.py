@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from telebip.control.policy import Policy
 from telebip.env import TelebipEnv
-from telebip.math import wrap_angle, yaw
+from telebip.math import columns, wrap_angle
 from telebip.rollout import judge_faults, walk
 
 Array = NDArray[np.floating]
@@ -159,19 +158,18 @@ def _walk_commands(
     velocity, power = torch.zeros(env.num_envs, 3, device=device), torch.zeros(env.num_envs, device=device)
     fallen, measured = torch.zeros_like(power, dtype=torch.bool), torch.zeros_like(power)
     env.set_commands(before)
-    walking, heading = walk(env, policy), yaw(env.sim.state.base_quat)
+    walking, heading = walk(env, policy), env.view().heading
     steps, change = round(protocol.duration / env.step_dt), round(protocol.change_at / env.step_dt)
     for step in range(steps):
         if step == change:
             env.set_commands(after)
         fallen |= next(walking).dones
-        state = env.sim.state
-        new = yaw(state.base_quat)
+        now = env.view()
         counts = ((step + 0.5) * env.step_dt > begin).float()
-        velocity += counts[:, None] * _velocity(state.base_lin_vel_w, new, wrap_angle(new - heading) / env.step_dt)
-        power += counts * state.joint_power.sum(1)
+        velocity += counts[:, None] * columns(now.heading_lin_vel, wrap_angle(now.heading - heading) / env.step_dt)
+        power += counts * now.state.joint_power.sum(1)
         measured += counts
-        heading = new
+        heading = now.heading
         progress(step + 1)
     judge_faults(env)
     return [
@@ -184,12 +182,6 @@ def _walk_commands(
             strict=True,
         )
     ]
-
-
-def _velocity(lin_vel_w: Tensor, heading: Tensor, yaw_rate: Tensor) -> Tensor:
-    """Return the velocity along and to the left of the heading and the yaw rate [m/s, m/s, rad/s], (num_envs, 3)."""
-    cos, sin, (vx, vy) = heading.cos(), heading.sin(), lin_vel_w[:, :2].unbind(1)
-    return torch.stack([cos * vx + sin * vy, cos * vy - sin * vx, yaw_rate], dim=1)
 
 
 def _row(command: Command, velocity: Array, power: Array, fallen: NDArray[np.bool_]) -> dict[str, Any]:

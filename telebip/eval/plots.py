@@ -157,7 +157,7 @@ def _map(axes: Axes, rows: Sequence[dict[str, Any]], column: int, error: str) ->
     worst = np.zeros((len(up), len(across)))
     for row in rows:
         at = up.index(row["command"][column]), across.index(row["command"][0])
-        worst[at] = np.fmax(worst[at], np.nan_to_num(np.array(row[error], dtype=float)))
+        worst[at] = np.fmax(worst[at], np.array(row[error], dtype=float))  # a NaN changes nothing
         if row["falls"]:
             axes.plot(at[1], at[0] - 0.3, "x", color="black", ms=4)
     axes.imshow(worst, origin="lower", aspect="auto", cmap="YlOrRd", vmin=0.0, vmax=0.15)

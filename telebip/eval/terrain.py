@@ -90,13 +90,12 @@ def terrain_results(
     distance, energy, time = (torch.zeros_like(heading) for _ in range(3))
     steps = math.ceil(protocol.seconds / env.step_dt)
     for step, stride in zip(range(1, steps + 1), walk(env, policy), strict=False):
-        state, psi, now = env.sim.state, env.view().heading, step * env.step_dt
+        view, now = env.view(), step * env.step_dt
         arrived |= walks & stride.extras["time_outs"]
         walks &= ~stride.dones & (now <= protocol.slack * way / protocol.command)
         if now > protocol.skip:
-            ahead = torch.cos(psi) * state.base_lin_vel_w[:, 0] + torch.sin(psi) * state.base_lin_vel_w[:, 1]
-            distance += env.step_dt * ahead * walks
-            energy += env.step_dt * state.joint_power.sum(1) * walks
+            distance += env.step_dt * view.heading_lin_vel[:, 0] * walks
+            energy += env.step_dt * view.state.joint_power.sum(1) * walks
             time += env.step_dt * walks
         progress(step)
     judge_faults(env)

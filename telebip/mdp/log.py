@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, stack
 
-from telebip.math import columns, norm
+from telebip.math import norm
 from telebip.mdp.faults import KINDS
 from telebip.mdp.step import Step
 
@@ -29,7 +29,7 @@ def means(step: Step, rewards: Tensor, terminations: Tensor, faults: Tensor) -> 
         faults: bool, (kinds, num_envs).
     """
     state, fault = step.state, faults.any(0)
-    error = step.command - columns(step.base_lin_vel_b[:, :2], step.base_ang_vel_b[:, 2])
+    error = step.command_error
     rows = [norm(error[:, :2]), error[:, 2].abs(), state.joint_power.sum(1), norm(step.base_lin_vel_b[:, :2])]
     table = torch.cat([rewards, terminations.float(), stack([*rows, step.fallen.float()])])
     mean = table.masked_fill(fault, 0.0).sum(1) / (~fault).sum()

@@ -42,9 +42,12 @@ def cmd(
     Returns:
         Reward [-], (num_envs,).
     """
-    lin_error = norm(step.command[:, :2] - step.base_lin_vel_b[:, :2])
-    yaw_error = (step.command[:, 2] - step.base_ang_vel_b[:, 2]).abs()
-    return k_xy * torch.exp(-lin_error / sigma_xy) + k_w * torch.exp(-yaw_error / sigma_w)
+    return _closeness(step.command_error, k_xy, sigma_xy, k_w, sigma_w)
+
+
+def _closeness(error: Tensor, k_xy: float, sigma_xy: float, k_w: float, sigma_w: float) -> Tensor:
+    """Return k_xy exp(-||e_xy|| / sigma_xy) + k_w exp(-|e_w| / sigma_w) of errors (num_envs, 3) [m/s, m/s, rad/s]."""
+    return k_xy * torch.exp(-norm(error[:, :2]) / sigma_xy) + k_w * torch.exp(-error[:, 2].abs() / sigma_w)
 
 
 def _stride(world: World, **_) -> Memory:
@@ -81,11 +84,9 @@ def stride_cmd(
     Returns:
         Reward [-], (num_envs,).
     """
-    error = step.command - columns(step.base_lin_vel_b[:, :2], step.base_ang_vel_b[:, 2])
     window = memory["error"]
-    window.copy_(torch.cat([error[:, :, None], window[:, :, :-1]], dim=2))
-    mean = window.mean(2)
-    return k_xy * torch.exp(-norm(mean[:, :2]) / sigma_xy) + k_w * torch.exp(-mean[:, 2].abs() / sigma_w)
+    window.copy_(torch.cat([step.command_error[:, :, None], window[:, :, :-1]], dim=2))
+    return _closeness(window.mean(2), k_xy, sigma_xy, k_w, sigma_w)
 
 
 @reward

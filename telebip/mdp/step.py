@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from telebip.math import over, rotate_inverse, turn, yaw, zeros
+from telebip.math import columns, over, rotate_inverse, turn, yaw, zeros
 from telebip.mdp.gait import phase_signals
 from telebip.mdp.ground import Ground
 from telebip.robot import Robot
@@ -155,6 +155,11 @@ class Step:
         """Command (vx, vy, yaw rate), body frame, the heading hold's correction included [m/s, m/s, rad/s], (num_envs, 3)."""
         return self.env.command
 
+    @cached_property
+    def command_error(self) -> Tensor:
+        """By how much the command exceeds the trunk's velocity and yaw rate, body frame [m/s, m/s, rad/s], (num_envs, 3)."""
+        return self.command - columns(self.base_lin_vel_b[:, :2], self.base_ang_vel_b[:, 2])
+
     @property
     def last_action(self) -> Tensor:
         """Action A_{t-1}, of the step before [-], (num_envs, num_joints)."""
@@ -215,6 +220,12 @@ class Step:
     def heading(self) -> Tensor:
         """Heading of the trunk in the world [rad], (num_envs,)."""
         return yaw(self.state.base_quat)
+
+    @cached_property
+    def heading_lin_vel(self) -> Tensor:
+        """Velocity of the trunk's frame along its heading and to the left of it, horizontal [m/s], (num_envs, 2)."""
+        cos, sin, (vx, vy, _) = torch.cos(self.heading), torch.sin(self.heading), self.state.base_lin_vel_w.unbind(1)
+        return columns(cos * vx + sin * vy, cos * vy - sin * vx)
 
     @cached_property
     def heading_quat(self) -> Tensor:

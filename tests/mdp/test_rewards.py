@@ -21,11 +21,13 @@ FORCE_RANGE = torch.tensor([[-50.0, 50.0], [-50.0, 50.0], [-400.0, 400.0]] * 2)
 def moving(command: Tensor, lin_vel: Tensor | None = None, ang_vel: Tensor | None = None) -> Any:
     """A step with these command and velocities of the trunk in the body frame."""
     still = torch.zeros_like(command)
-    return SimpleNamespace(
+    step: Any = SimpleNamespace(
         command=command,
         base_lin_vel_b=still if lin_vel is None else lin_vel,
         base_ang_vel_b=still if ang_vel is None else ang_vel,
     )
+    step.command_error = Step.command_error.func(step)
+    return step
 
 
 def velocity_tracking(lin_vel: Tensor, command: Tensor, k_xy: float, sigma_xy: float) -> Tensor:
