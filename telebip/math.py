@@ -2,7 +2,7 @@
 
 A tensor (num_envs, size) lies column by column: what is one number of every world is one stretch of memory, over which a
 processor's vector unit passes in one go. Row by row, an operation on a column hops through memory, and takes up to ten times as
-long (docs/performance.md). Shapes and values know nothing of it.
+long (docs/tried.md). Shapes and values know nothing of it.
 """
 
 import torch

@@ -10,7 +10,7 @@ checkpoints are its own, and `tests/rl/test_ppo.py` holds an update against its.
 - Adam is fused: one pass over the parameters instead of a dozen.
 - Advantages are normalised over the samples of all processes (`telebip.rl.distributed`); rsl-rl's are over those of one.
 
-docs/performance.md has what the first three are worth.
+docs/tried.md has what the first three are worth.
 """
 
 # pyright: reportOptionalMemberAccess=false, reportOptionalIterable=false
