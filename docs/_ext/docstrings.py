@@ -17,7 +17,7 @@ def to_rst(lines: list[str]) -> list[str]:
         is_indented = line.startswith("    ") and not in_section
         if is_indented and not is_literal and out and not out[-1].strip():
             is_literal = True
-            out += ["::", ""]
+            out += [".. code-block:: text", ""]
         elif line.strip() and not is_indented:
             is_literal = False
         out.append(line if is_literal else escaped(line))
