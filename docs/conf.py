@@ -27,7 +27,7 @@ html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_theme_options = {"navigation_with_keys": True}
 html_show_sphinx = False
-html_copy_source = False
+html_copy_source = html_show_copyright = False
 highlight_language = "bash"
 pygments_style, pygments_dark_style = "tango", "monokai"
 

@@ -50,9 +50,9 @@ def what_pages_enter_is_taken_out_again(monkeypatch: pytest.MonkeyPatch) -> Iter
     before = {kind: dict(terms) for kind, terms in TERMS.items()}
     monkeypatch.setattr(learner, "ALGORITHMS", dict(learner.ALGORITHMS))
     yield
-    for kind, terms in before.items():
-        TERMS[kind].clear()
-        TERMS[kind].update(terms)
+    for kind, terms in TERMS.items():
+        terms.clear()
+        terms.update(before[kind])
 
 
 class Parsed(Exception):

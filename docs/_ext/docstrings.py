@@ -35,6 +35,8 @@ def escaped(line: str) -> str:
 def process(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
     """Rewrite a docstring in place, before napoleon reads its sections."""
     lines[:] = to_rst(lines)
+    if what in ("property", "attribute"):  # napoleon takes what stands before a colon of the first line for a type
+        lines.insert(0, "")
 
 
 def setup(app: Sphinx) -> dict[str, bool]:

@@ -19,11 +19,15 @@ from telebip import ROOT
 from telebip.config import task_names
 from telebip.config.schema import TaskConfig
 from telebip.config.tree import Entry, read
+from telebip.mdp.step import EnvState, World
 from telebip.mdp.term import TERMS, Kind, ObservationGroup, Parameter, Term
+from telebip.rollout import Rollout
+from telebip.sim.base import SimState
 
 BASE = "configs/telebip_flat.yaml"
 TEXT = (ROOT / BASE).read_text(encoding="utf-8")
 FLAT = read(TEXT, BASE)
+OBSERVED = FLAT.value["observations"].value["policy"].value
 KINDS: dict[Kind, str] = {"reward": "rewards", "termination": "terminations", "event": "events"}
 COMMANDS = ("train", "play", "evaluate", "export", "reproduce", "sweep", "benchmark", "race", "gallery", "gpu_check")
 NAMES = {float: "number", int: "whole number", str: "text", bool: "true, false"}
@@ -65,6 +69,23 @@ def terms(kind: Kind) -> str:
     return "\n".join(_term(term) for term in TERMS[kind].values() if term.function.__module__.startswith("telebip."))
 
 
+def observations() -> str:
+    """Return a table of all observations, and the parameters of those that have some of their own."""
+    rows = []
+    for term in (term for term in TERMS["observation"].values() if term.function.__module__.startswith("telebip.")):
+        noise, said = _in_base(term), " ".join(_docstring(term.function)[0].split("\n\n")[0].split())
+        value = _shown(noise["noise"]) if "noise" in noise else "0" if term.name in OBSERVED else ""
+        rows.append(f"| `{term.name}` | {value} | {_cell(term.unit)} | {_cell(said)} |")
+    table = ["| observation | noise in `telebip_flat` | unit | what it is |", "|---|---|---|---|", *rows]
+    return "\n".join([*table, *(_term(term) for term in TERMS["observation"].values() if term.own_parameters)])
+
+
+def attributes(owner: type) -> str:
+    """Return a table of a dataclass's fields, with the comments that stand beside them."""
+    found = re.findall(r"^    (\w+): [^#\n]+  # (.+)$", inspect.getsource(owner), re.MULTILINE)
+    return "\n".join(["| field | what it is |", "|---|---|", *(f"| `{name}` | {_cell(said)} |" for name, said in found)])
+
+
 def _term(term: Term) -> str:
     text, arguments = _docstring(term.function)
     given = _in_base(term)
@@ -77,11 +98,10 @@ def _term(term: Term) -> str:
 
 def _in_base(term: Term) -> dict[str, Entry]:
     """Return the parameters that the base task gives a term; none where it has not got it."""
-    sections = FLAT.value
     if term.kind == "terrain":
         return {}
-    entries = sections["observations"].value["policy"] if term.kind == "observation" else sections[KINDS[term.kind]]
-    return entries.value[term.name].value if term.name in entries.value else {}
+    entries = OBSERVED if term.kind == "observation" else FLAT.value[KINDS[term.kind]].value
+    return entries[term.name].value if term.name in entries else {}
 
 
 def _docstring(function: Callable[..., Any]) -> tuple[str, dict[str, str]]:
@@ -107,7 +127,11 @@ def _row(name: str, parameter: Parameter, given: Entry | None = None, said: str 
         value = "must be given" if parameter.default is ... else f"default {_yaml(parameter.default)}"
     said = said.removeprefix(f"{unit}; ") if unit else said
     cells = (f"`{name}`", value, unit, _bounds(parameter), f"{said} ({where})" if where and said else said or where)
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+    return "| " + " | ".join(map(_cell, cells)) + " |"
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|")
 
 
 def _shown(entry: Entry) -> str:
@@ -169,7 +193,9 @@ PARTS: dict[str, Callable[[], str]] = {
     "configuration": configuration,
     "tasks": tasks,
     "commands": commands,
+    "observations": observations,
     **{f"terms {kind}": lambda kind=kind: terms(kind) for kind in TERMS},
+    **{f"fields {owner.__name__}": lambda owner=owner: attributes(owner) for owner in (SimState, World, EnvState, Rollout)},
 }
 
 
