@@ -36,7 +36,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     with console.status("loading torch and the physics engine"):
         from telebip.eval.omni import OmniProtocol
         from telebip.eval.push import PushProtocol
-        from telebip.eval.report import write_report
+        from telebip.eval.report import summary, write_report
         from telebip.eval.suites import Protocol, check_suites
         from telebip.eval.terrain import TerrainProtocol
     suites = check_suites(options.suite.split(","))
@@ -61,9 +61,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     results = measure(console, candidate, suites, protocol, out)
     title, text = f"{candidate.label}: how it walks", f"Measured by: {candidate.source}"
     write_report([results], out, title, text, references=references())
-    lines = (out / "report.md").read_text(encoding="utf-8").splitlines()
-    console.print("\n".join(line for line in lines if not line.startswith("![")))
-    console.print(f"wrote {out}/results.json, report.md with its pictures, and report.html")
+    console.print(summary(results, console.width))
+    console.print(f"wrote results.json, report.md with its pictures, and report.html to\n{out}")
 
 
 def measure(console, candidate, suites: Sequence[str], protocol, out: Path) -> dict:
@@ -154,10 +153,10 @@ def references() -> list[dict]:
 
 @contextmanager
 def progress_bar(console):
-    """Yield a function that shows what is running, how far it is and how long it will take."""
+    """Yield a function that shows what is running, how long it will take and how far it is, whole on 60 columns."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TextColumn("eta"), TimeRemainingColumn())
+    columns = (TextColumn("{task.description}"), TextColumn("eta"), TimeRemainingColumn(), BarColumn(20), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
         tasks = {}
 

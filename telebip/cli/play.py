@@ -194,15 +194,17 @@ def _policy(who: str, env, overrides: Sequence[str]):
 
 
 def _lines(s) -> str:
-    transport = f"{s.cost_of_transport:.3f} mechanical, {s.cost_of_transport_article:.3f} by the article's formula"
+    """Return what was measured, in lines that are whole on 60 columns."""
     rows = (
-        ("command", f"{s.command[0]:.2f} m/s forward, {s.command[1]:.2f} m/s left, {s.command[2]:.2f} rad/s"),
-        ("mean speed", f"{s.speed[0]:.3f} m/s forward (spread over worlds {s.speed_spread:.3f}), {s.speed[1]:.3f} m/s left"),
-        ("tracking error", f"{s.lin_vel_error:.3f} m/s (mean of ||v_cmd - v||), yaw rate {s.yaw_rate:+.3f} rad/s"),
+        ("command", f"{s.command[0]:.2f} m/s forward, {s.command[1]:.2f} left, {s.command[2]:.2f} rad/s"),
+        ("mean speed", f"{s.speed[0]:.3f} m/s forward, {s.speed[1]:.3f} left"),
+        *([("spread", f"{s.speed_spread:.3f} m/s, of the worlds' mean speeds")] if s.worlds > 1 else ()),
+        ("tracking error", f"{s.lin_vel_error:.3f} m/s, mean of ||v_cmd - v||"),
+        ("yaw rate", f"{s.yaw_rate:+.3f} rad/s"),
         ("heading drift", f"{s.yaw_drift_deg:.1f} deg at the end"),
-        ("cost of transport", transport),
+        ("cost of transport", f"{s.cost_of_transport:.3f} mechanical, {s.cost_of_transport_article:.3f} as the article's"),
         ("gait period", f"{s.gait_period:.3f} s"),
-        ("falls", f"{s.falls} (all else is measured after the first {s.skipped:g} s)"),
+        ("falls", f"{s.falls}; all else after the first {s.skipped:g} s"),
     )
     return "\n".join(f"  {name:18}{value}" for name, value in rows)
 

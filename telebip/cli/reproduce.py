@@ -65,7 +65,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     seeds = [f"{t.label} ({n} seed{'s' if n > 1 else ''})" for t in TRAININGS if (n := len(results[t.name]))]
     text = INTRODUCTION.format(trainings=", ".join(seeds) or "none")
     write_report([one for each in results.values() for one in each], out, "The study", text, references())
-    console.print(f"wrote {out}/report.md and report.html, about {sum(map(bool, results.values()))} of {len(names)} walkers")
+    console.print(f"wrote report.md and report.html, about {sum(map(bool, results.values()))} of {len(names)} walkers, to")
+    console.print(f"{out}")
 
 
 def _measured(out: Path, name: str, seeds: bool) -> list[Path]:
@@ -94,10 +95,10 @@ def _train(console, training, seed: int, options: argparse.Namespace) -> Path | 
     config = replace(config, seed=seed)
     checkpoint = open_checkpoint(run_dir) if any(run_dir.glob("model_*.pt")) else None
     if checkpoint and checkpoint.iteration >= config.ppo.max_iterations:
-        console.print(f"{training.name}, seed {seed}: trained already, {checkpoint.samples / 1e6:.1f} M samples in {run_dir}")
+        console.print(f"{training.name}, seed {seed}: trained already, {checkpoint.samples / 1e6:.1f} M samples\n{run_dir}")
         return run_dir
     make_folder(run_dir)
-    console.print(f"{training.name}, seed {seed}: training in {run_dir}")
+    console.print(f"{training.name}, seed {seed}: training")
     start = Start(training.task, config, run_dir, checkpoint=checkpoint, allow_robot_change=options.allow_robot_change)
     return run_dir if train(start, options.device) else None
 
@@ -117,7 +118,7 @@ def _measure(console, out: Path, walker, options: argparse.Namespace, candidate)
         console.print(f"{walker.name}: measured already")
         return
     measure(console, candidate, walker.suites, protocol, out)
-    console.print(f"{walker.name}: measured, see {file}")
+    console.print(f"{walker.name}: measured\n{file}")
 
 
 def _is_current(file: Path, candidate, suites: Sequence[str], protocol) -> bool:

@@ -49,6 +49,25 @@ def write_report(
     write(out / "report.html", _PAGE.format(title=html.escape(title), body="\n".join(page)))
 
 
+def summary(results: Results, width: int) -> str:
+    """Return the tables of one walker for a terminal of `width` columns: a line for each number, a column for each row."""
+    tables = [table for table in _tables([results]) if table[2]]
+    return "\n\n".join([str(results["label"]), *(_upright(*table, width) for table in tables)])
+
+
+def _upright(heading: str, header: list[str], rows: list[list[str]], width: int) -> str:
+    """Return a table turned on its side, without the walker's name; as many columns beside each other as there is room for."""
+    names = [f"  {name}" for name in header[1:]]
+    left, column = max(map(len, names)), 2 + max(len(cell) for row in rows for cell in row[1:])
+    at_once = max(1, (width - left) // column)
+    parts = [rows[i : i + at_once] for i in range(0, len(rows), at_once)]
+    lines = [
+        "\n".join(name.ljust(left) + "".join(row[i].rjust(column) for row in part) for i, name in enumerate(names, start=1))
+        for part in parts
+    ]
+    return "\n".join([heading, "\n\n".join(lines)])
+
+
 def write_results(results: Results, out: Path) -> None:
     """Write `results.json`; numbers that are not finite become null, which JSON can hold."""
     write(out / "results.json", json.dumps(_finite(results), indent=1) + "\n")

@@ -122,7 +122,7 @@ def test_results_that_lack_something_are_measured_again_or_named(tmp_path: Path)
     files["period_06"].unlink()
     assert "dcm: measured already" in ran(REPRODUCE, *where)
     files["dcm"].write_text("{")
-    assert "dcm: measured, see" in ran(REPRODUCE, *where)
+    assert "dcm: measured\n" in ran(REPRODUCE, *where)
 
 
 def test_other_seeds_are_left_out_of_the_report_of_what_is_shipped(tmp_path: Path) -> None:

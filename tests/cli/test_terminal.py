@@ -1,0 +1,43 @@
+"""What `play.py` and `evaluate.py` show on a terminal: every line is whole, however narrow it is."""
+
+import io
+import json
+
+import pytest
+from rich.console import Console
+
+from telebip import ROOT
+from telebip.cli import play
+from telebip.cli.evaluate import progress_bar
+from telebip.eval.report import summary
+
+RESULTS = json.loads((ROOT / "docs" / "results" / "telebip_efficient" / "results.json").read_text(encoding="utf-8"))
+WIDTHS = (60, 80, 120, 200)
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_the_progress_of_a_measurement_is_whole(width: int) -> None:
+    screen = io.StringIO()
+    console = Console(file=screen, force_terminal=True, width=width, highlight=False, color_system=None)
+    with progress_bar(console) as show:
+        show("walking in 2800 of 4600 worlds", 3, 10)
+    assert "walking in 2800 of 4600 worlds eta " in screen.getvalue()
+    assert "…" not in screen.getvalue()
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_the_summary_of_a_measurement_fits_the_terminal(width: int) -> None:
+    lines = summary(RESULTS, width).splitlines()
+    assert max(map(len, lines)) <= width
+    (speeds, *_) = [line.split()[3:] for line in lines if line.startswith("  mean speed [m/s]")]
+    assert speeds[:3] == [f"{RESULTS['tracking'][0]['mean_speed_mps']:.3f}", "±", f"{RESULTS['tracking'][0]['ci95_mps']:.3f}"]
+    (pushes, *_) = [line.split() for line in lines if line.startswith("  forward [N]")]
+    assert pushes[-1] == f"{RESULTS['push']['10s']['forward_n']:.0f}"
+
+
+def test_what_play_measures_fits_60_columns(capsys: pytest.CaptureFixture[str]) -> None:
+    policy = str(ROOT / "assets" / "policies" / "telebip_efficient")
+    play.main(["--checkpoint", policy, "--duration", "1", "--device", "cpu", "--num-envs", "2"])
+    _, *lines = capsys.readouterr().out.splitlines()
+    assert [line.split("  ")[1].strip() for line in lines[:3]] == ["command", "mean speed", "spread"]
+    assert max(map(len, lines)) <= 60
