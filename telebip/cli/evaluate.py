@@ -62,7 +62,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     title, text = f"{candidate.label}: how it walks", f"Measured by: {candidate.source}"
     write_report([results], out, title, text, references=references())
     console.print(summary(results, console.width))
-    console.print(f"wrote results.json, report.md with its pictures, and report.html to\n{out}")
+    console.print(f"wrote report.md, report.html and results.json to\n{out}")
 
 
 def measure(console, candidate, suites: Sequence[str], protocol, out: Path) -> dict:

@@ -100,8 +100,8 @@ def _play(options: argparse.Namespace) -> None:
         rollouts.append((name.upper() if name in CONTROLLERS else name, rollout))
         summary = summarise(rollout, skip=min(5.0, 0.25 * options.duration))
         who = checkpoint.path if checkpoint and name == "RL" else f"{'agent' if name in AGENTS else 'controller'} '{name}'"
-        console.print(f"{who}: {task}, {summary.worlds} world{'s' if summary.worlds > 1 else ''} x {summary.duration:g} s")
-        console.print(_lines(summary))
+        console.print(f"{who}:")
+        console.print(_lines(task, summary))
     _show(console, options, rollouts, env.robot)
 
 
@@ -193,9 +193,10 @@ def _policy(who: str, env, overrides: Sequence[str]):
     return Stateless(lambda obs: torch.randn(shape, generator=env.generator, device=env.device))
 
 
-def _lines(s) -> str:
+def _lines(task: str, s) -> str:
     """Return what was measured, in lines that are whole on 60 columns."""
     rows = (
+        ("task", f"{task}, {s.worlds} world{'s' if s.worlds > 1 else ''} x {s.duration:g} s"),
         ("command", f"{s.command[0]:.2f} m/s forward, {s.command[1]:.2f} left, {s.command[2]:.2f} rad/s"),
         ("mean speed", f"{s.speed[0]:.3f} m/s forward, {s.speed[1]:.3f} left"),
         *([("spread", f"{s.speed_spread:.3f} m/s, of the worlds' mean speeds")] if s.worlds > 1 else ()),

@@ -58,7 +58,7 @@ def summary(results: Results, width: int) -> str:
 def _upright(heading: str, header: list[str], rows: list[list[str]], width: int) -> str:
     """Return a table turned on its side, without the walker's name; as many columns beside each other as there is room for."""
     names = [f"  {name}" for name in header[1:]]
-    left, column = max(map(len, names)), 2 + max(len(cell) for row in rows for cell in row[1:])
+    left, column = max(map(len, names)), 1 + max(len(cell) for row in rows for cell in row[1:])
     at_once = max(1, (width - left) // column)
     parts = [rows[i : i + at_once] for i in range(0, len(rows), at_once)]
     lines = [

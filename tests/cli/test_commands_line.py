@@ -140,9 +140,9 @@ def test_a_trained_policy_can_be_played_and_recorded(run_dir: Path) -> None:
     text = ran(
         PLAY, "--checkpoint", str(run_dir), "--duration", "1", "--record", str(record), "--device", "cpu", *others, run=fresh
     )
-    assert "model_2.pt: telebip_slow, 1 world x 1 s" in text
-    assert "agent 'zero': telebip_slow, 1 world x 1 s" in text
-    assert "agent 'random': telebip_slow, 1 world x 1 s" in text
+    assert "model_2.pt:\n  task              telebip_slow, 1 world x 1 s" in text
+    assert "agent 'zero':\n  task              telebip_slow, 1 world x 1 s" in text
+    assert "agent 'random':\n  task              telebip_slow, 1 world x 1 s" in text
     assert "0.55 m/s forward" in text  # the middle of telebip_slow's 0.4 to 0.7
     assert record.stat().st_size > 10_000
 
@@ -173,7 +173,7 @@ def test_a_model_based_walker_can_be_played() -> None:
     text = ran(
         PLAY, "--controller", "alip", "--command", "0.5", "0", "0", "--duration", "1", "--device", "cpu", "control.reach=0.4"
     )
-    assert "controller 'alip': telebip_flat, 1 world x 1 s" in text
+    assert "controller 'alip':\n  task              telebip_flat, 1 world x 1 s" in text
 
 
 def test_a_policy_is_not_played_on_other_observations_or_joints(tmp_path: Path) -> None:

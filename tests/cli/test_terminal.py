@@ -39,5 +39,5 @@ def test_what_play_measures_fits_60_columns(capsys: pytest.CaptureFixture[str]) 
     policy = str(ROOT / "assets" / "policies" / "telebip_efficient")
     play.main(["--checkpoint", policy, "--duration", "1", "--device", "cpu", "--num-envs", "2"])
     _, *lines = capsys.readouterr().out.splitlines()
-    assert [line.split("  ")[1].strip() for line in lines[:3]] == ["command", "mean speed", "spread"]
+    assert [line.split("  ")[1].strip() for line in lines[:4]] == ["task", "command", "mean speed", "spread"]
     assert max(map(len, lines)) <= 60
