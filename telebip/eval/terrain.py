@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from telebip.config import TaskConfig, check
 from telebip.control.policy import Policy
 from telebip.env import TelebipEnv
+from telebip.eval.statistics import share_interval
 from telebip.rollout import judge_faults, walk
 
 DEGREE = math.pi / 180.0
@@ -116,9 +117,9 @@ def terrain_results(
 
 def _row(arrived: NDArray[np.bool_], measured: Mapping[str, NDArray[np.floating]]) -> dict[str, Any]:
     """Return the share of a tile's robots (n,) that arrived, and the medians of what was measured of these."""
-    number, least_most = int(arrived.sum()), wilson(int(arrived.sum()), len(arrived))
+    number, interval = int(arrived.sum()), share_interval(int(arrived.sum()), len(arrived))
     medians = {key: float(np.median(values[arrived])) if number else math.nan for key, values in measured.items()}
-    row = {"success": number / len(arrived), "success_low": least_most[0], "success_high": least_most[1], **medians}
+    row = {"success": number / len(arrived), "success_low": interval[0], "success_high": interval[1], **medians}
     return {"worlds": len(arrived), **{key: round(value, 5) for key, value in row.items()}}
 
 
@@ -130,11 +131,3 @@ def limit(rows: Sequence[dict[str, Any]], passed: float) -> float:
             break
         size = row["size"]
     return size
-
-
-def wilson(successes: int, number: int) -> tuple[float, float]:
-    """Return the 95 % interval of a share, by Wilson's score (1927), which holds at shares of 0 and 1 too."""
-    z, share = 1.959964, successes / number
-    middle = (share + z * z / (2 * number)) / (1 + z * z / number)
-    half = z / (1 + z * z / number) * math.sqrt(share * (1 - share) / number + z * z / (4 * number**2))
-    return max(0.0, middle - half), min(1.0, middle + half)

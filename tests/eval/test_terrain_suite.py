@@ -12,17 +12,9 @@ from telebip.config import load_task
 from telebip.control.policy import Stateless
 from telebip.env import TelebipEnv
 from telebip.eval.conditions import as_evaluated
-from telebip.eval.terrain import LEVELS, SIZE, TYPES, TerrainProtocol, limit, on_test_ground, terrain_results, wilson
+from telebip.eval.statistics import share_interval
+from telebip.eval.terrain import LEVELS, SIZE, TYPES, TerrainProtocol, limit, on_test_ground, terrain_results
 from telebip.robot import Robot
-
-
-@pytest.mark.parametrize(
-    ("successes", "number", "low", "high"),
-    [(64, 64, 0.9434, 1.0), (0, 64, 0.0, 0.0566), (61, 64, 0.8710, 0.9839), (5, 10, 0.2366, 0.7634)],
-)
-def test_wilson_s_interval(successes: int, number: int, low: float, high: float) -> None:
-    """64 of 64: 64 / (64 + z^2); 5 of 10 is in many textbooks."""
-    assert wilson(successes, number) == pytest.approx((low, high), abs=2e-4)
 
 
 def test_the_limit_is_the_last_level_before_the_first_that_is_not_passed() -> None:
@@ -69,7 +61,7 @@ def test_who_glides_over_the_ground_arrives_and_who_is_slow_or_falls_does_not(
     results = terrain_results(env, Stateless(glide(env)), protocol)
     (row,) = results["levels"]
     assert row["success"] == 0.5  # 1.7 is more than 2.0 / 1.25, and 1.5 is less
-    assert (row["success_low"], row["success_high"]) == pytest.approx(wilson(2, 4), abs=1e-4)
+    assert (row["success_low"], row["success_high"]) == pytest.approx(share_interval(2, 4), abs=1e-4)
     assert results["limits"] == {"waves": 0.0}
     assert math.isfinite(row["cot"])
     assert SIZE == 6.0
