@@ -46,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         duration=options.duration,
         skip=min(5.0, 0.25 * options.duration),
         commands=options.commands,
-        push=PushProtocol(max_force=options.max_force, worlds=options.push_worlds),
+        push=PushProtocol(max_force=options.max_force, worlds=min(32, options.push_worlds), limit_worlds=options.push_worlds),
         omni=OmniProtocol(worlds=options.omni_worlds),
         terrain=TerrainProtocol(worlds=options.terrain_worlds),
         device=resolve_device(options.device),
@@ -163,7 +163,7 @@ def progress_bar(console):
         def show(name: str, step: int, total: int) -> None:
             if name not in tasks:
                 tasks[name] = progress.add_task(name, total=total)
-            progress.update(tasks[name], completed=step)
+            progress.update(tasks[name], completed=step, total=total)
 
         yield show
 
@@ -203,7 +203,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         "--commands=-0.3,0.5 where the first is negative",
     )
     parser.add_argument("--max-force", type=float, default=300.0, metavar="N", help="largest push tried in N (default: 300)")
-    parser.add_argument("--push-worlds", type=int, default=32, metavar="N", help="worlds for each push (default: 32)")
+    parser.add_argument("--push-worlds", type=int, default=300, metavar="N", help="worlds at the largest pushes (default: 300)")
     parser.add_argument("--omni-worlds", type=int, default=16, metavar="N", help="worlds for each omni command (default: 16)")
     parser.add_argument("--terrain-worlds", type=int, default=64, metavar="N", help="worlds for each level (default: 64)")
     parser.add_engine()

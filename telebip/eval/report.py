@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from telebip.errors import UserError
 from telebip.eval import plots
+from telebip.eval.suites import SCHEMA
 
 Results = dict[str, Any]
 Table = tuple[str, list[str], list[list[str]]]  # title, header and rows
@@ -83,7 +84,7 @@ def read_results(path: Path) -> Results:
         results = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise UserError(f"results '{path}' cannot be read: {error}") from error
-    if not isinstance(results, dict) or results.get("schema") != "telebip-results-1":
+    if not isinstance(results, dict) or results.get("schema") != SCHEMA:
         raise UserError(f"'{path}' holds no results of this version of telebip")
     return results
 
@@ -165,7 +166,7 @@ def _tables(all_results: Sequence[Results]) -> list[Table]:
     omni += ["forward [m/s]", "backward [m/s]", "sideways [m/s]", "turning [rad/s]"]
     rough = of("terrain")
     kinds = [name.replace("_", " ") for name in rough[0][1]["limits"]] if rough else []
-    horizons = sorted({h for _, limits in of("push") for h in limits if h != "protocol"}, key=lambda h: float(h[:-1]))
+    horizons = sorted({h for _, limits in of("push") for h in limits if h.endswith("s") and h[0].isdigit()}, key=_seconds)
     return [
         ("Tracking and cost of transport", tracking, [[k, *_tracking_cells(r)] for k, rows in of("tracking") for r in rows]),
         *(
@@ -185,6 +186,10 @@ def _tables(all_results: Sequence[Results]) -> list[Table]:
         ("Gait", gait, [[label, *(number(value, 3) for value in row.values())] for label, row in of("gait")]),
         ("Learning", learning, [[label, *_learning_cells(curve)] for label, curve in of("learning")]),
     ]
+
+
+def _seconds(horizon: str) -> float:
+    return float(horizon.removesuffix("s"))
 
 
 def _tracking_cells(row: dict[str, Any]) -> list[str]:

@@ -23,13 +23,14 @@ from telebip.eval.conditions import SPEEDS, as_evaluated, forward_commands, on_f
 from telebip.eval.gait import summarise_gait
 from telebip.eval.learning import learning_curve
 from telebip.eval.omni import OmniProtocol, omni_results
-from telebip.eval.push import PushProtocol, push_limits, push_trial
+from telebip.eval.push import PushProtocol, push_limits
 from telebip.eval.terrain import TerrainProtocol, on_test_ground, terrain_results
 from telebip.eval.walk import heading_velocity, summarise
 from telebip.robot import Robot
 from telebip.rollout import Rollout, roll_out
 from telebip.sim import Backend, choose_backend
 
+SCHEMA = "telebip-results-2"
 SUITES = ("tracking", "push", "gait", "learning", "omni", "terrain")
 Progress = Callable[[str, int, int], None]  # called with what is running, the finished steps and their total
 
@@ -83,7 +84,7 @@ def evaluate(
     run_dir = candidate.run_dir if "learning" in suites else None
     curve = learning_curve(run_dir) if run_dir else None  # first: it may be damaged
     results: dict[str, Any] = {
-        "schema": "telebip-results-1",
+        "schema": SCHEMA,
         "label": candidate.label,
         "source": candidate.source,
         "fingerprint": candidate.fingerprint,
@@ -210,9 +211,8 @@ def _gait(rollout: Rollout, robot: Robot, command: float, skip: float, clock: fl
 def _push(candidate: Candidate, robot: Robot, protocol: Protocol, progress: Progress) -> dict[str, Any]:
     push = _push_protocol(candidate, protocol)
     env = make_env(candidate, robot, protocol, push.num_envs, push.seconds)
-    name, total = f"pushing {push.num_envs} worlds", round(push.seconds / env.step_dt)
-    survival = push_trial(env, candidate.make_policy(env), push, lambda step: progress(name, step, total))
-    return {"protocol": asdict(push), **push_limits(survival, push, robot.weight)}
+    limits = push_limits(env, candidate.make_policy(env), push, lambda ended, asked: progress("pushing", ended, asked))
+    return {"protocol": _as_json(push), **limits}
 
 
 def _terrain(candidate: Candidate, robot: Robot, protocol: Protocol, progress: Progress) -> dict[str, Any]:

@@ -32,7 +32,7 @@ PROTOCOL = Protocol(
     worlds=4,
     duration=8.0,
     skip=3.0,
-    push=PushProtocol(max_force=10.0, worlds=1, warmup=1.0, horizons=(1.0, 2.0)),
+    push=PushProtocol(max_force=10.0, worlds=1, limit_worlds=2, warmup=1.0, horizons=(1.0, 2.0), num_envs=8),
     omni=OMNI,
     terrain=TerrainProtocol(worlds=1),
 )
@@ -63,14 +63,15 @@ def test_tracking_measures_every_trained_command(results: dict[str, Any]) -> Non
 def test_gait_and_pushes(results: dict[str, Any]) -> None:
     assert results["gait"]["period_s"] == pytest.approx(0.5, rel=0.02)
     assert 0.8 < results["gait"]["symmetry"] <= 1.0
-    survivors = results["push"]["1s"]["survivors"]
-    assert survivors == {direction: [1, 1] for direction in ("forward", "backward", "left", "right")}
-    assert results["push"]["1s"] == {
-        "survivors": survivors,
-        **dict.fromkeys(("forward_n", "backward_n", "lateral_n"), 10.0),
+    push = results["push"]["1s"]
+    assert push["tried"] == {direction: [[10.0, 2, 0]] for direction in ("forward", "backward", "left", "right")}
+    assert push["shares"]["left"] == {"share": 1.0, "share_low": 0.3424, "share_high": 1.0, "worlds": 2}
+    assert {name: value for name, value in push.items() if name not in ("tried", "shares")} == {
+        **dict.fromkeys(("forward_n", "backward_n", "lateral_n", "forward_95_n", "backward_95_n", "lateral_95_n"), 10.0),
         **dict.fromkeys(("forward_ns", "backward_ns", "lateral_ns"), 1.0),
         **dict.fromkeys(("forward_bw", "backward_bw", "lateral_bw"), round(10.0 / (13.6 * 9.81), 4)),
     }
+    assert results["push"]["world_steps"] % 8 == 0
 
 
 def test_all_directions(results: dict[str, Any]) -> None:
