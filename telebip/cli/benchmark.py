@@ -28,9 +28,8 @@ def main(argv: Sequence[str] | None = None) -> None:
 
         from telebip.cli.evaluate import progress_bar
         from telebip.rl.process import keep_freed_memory
-        from telebip.rl.run import describe_code
+        from telebip.rl.run import describe_code, machine_name
         from telebip.tools.benchmark import configurations, measure, shipped_for, table
-        from telebip.tools.measuring import machine_name
 
     given = options.checkpoint
     checkpoint = open_checkpoint(given) if given else shipped_for(options.task, options.overrides)

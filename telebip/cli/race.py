@@ -30,8 +30,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         from telebip.cli.evaluate import progress_bar
         from telebip.eval import plots
         from telebip.rl.process import keep_freed_memory
-        from telebip.rl.run import describe_code
-        from telebip.tools.measuring import machine_name
+        from telebip.rl.run import describe_code, machine_name
         from telebip.tools.race import RACERS, race, sentence, verdict
 
     first = load_task(options.task, options.overrides)

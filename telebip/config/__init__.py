@@ -5,7 +5,18 @@ the numbers stand in `configs/`. `tree` reads and merges YAML, `validation` make
 Whatever a user gets wrong is a `UserError` that names the field, the file and line (or the override) and what would be valid.
 """
 
-from telebip.config.loading import CONFIGS, check, load, load_task, parse_config, task_names, to_yaml
+from telebip.config.loading import CONFIGS, check, load, load_task, parse_config, study_names, task_names, to_yaml
 from telebip.config.schema import ObservationGroup, TaskConfig
 
-__all__ = ["CONFIGS", "ObservationGroup", "TaskConfig", "check", "load", "load_task", "parse_config", "task_names", "to_yaml"]
+__all__ = [
+    "CONFIGS",
+    "ObservationGroup",
+    "TaskConfig",
+    "check",
+    "load",
+    "load_task",
+    "parse_config",
+    "study_names",
+    "task_names",
+    "to_yaml",
+]

@@ -16,6 +16,7 @@ from telebip.errors import UserError, nearest
 from telebip.files import is_file
 
 CONFIGS = ROOT / "configs"
+FOLDERS = (CONFIGS, CONFIGS / "study")  # of the tasks that have names; those in the second one are of the study alone
 
 Schema = TypeVar("Schema")
 
@@ -69,8 +70,13 @@ def to_yaml(config: Any) -> str:
 
 
 def task_names() -> list[str]:
-    """Return the names that `--task` accepts."""
-    return sorted(path.stem for path in CONFIGS.glob("*.yaml"))
+    """Return the names of the tasks; `--task` accepts those of `study_names` too."""
+    return sorted(path.stem for path in FOLDERS[0].glob("*.yaml"))
+
+
+def study_names() -> list[str]:
+    """Return the names of the tasks that the study alone is about: ablations."""
+    return sorted(path.stem for path in FOLDERS[1].glob("*.yaml"))
 
 
 def _read_task(task: str, named_at: str = "", below: tuple[Path, ...] = ()) -> Tree:
@@ -83,7 +89,7 @@ def _read_task(task: str, named_at: str = "", below: tuple[Path, ...] = ()) -> T
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"{named_at}{_shown(path)}: {error}") from error
     tree = _section(read(text, _shown(path)), _shown(path))
-    folders = [path.parent, Path()] if path.parent != CONFIGS else [path.parent]
+    folders = [path.parent, Path()] if path.parent not in FOLDERS else [path.parent]
     tree = _with_robot_found(tree, *folders)
     base = tree.pop("base", None)
     if base is None:
@@ -123,14 +129,14 @@ def _with_robot_found(tree: Tree, *folders: Path) -> Tree:
 
 
 def _task_path(task: str, named_at: str, *folders: Path) -> Path:
-    """Return a task's file: a name's in `configs/`, a path's from the first of `folders` or the working directory."""
+    """Return a task's file: a name's in `FOLDERS`, a path's from the first of `folders` or the working directory."""
     names_file = task.endswith((".yaml", ".yml"))
-    paths = [folder / task for folder in (*folders, Path())] if names_file else [CONFIGS / f"{task}.yaml"]
+    paths = [folder / task for folder in (*folders, Path())] if names_file else [folder / f"{task}.yaml" for folder in FOLDERS]
     if path := next(filter(is_file, paths), None):
         return path
     if names_file:
         raise UserError(f"{named_at}task file '{task}' does not exist")
-    raise UserError(f"{named_at}unknown task '{task}'; {nearest(task, task_names())}")
+    raise UserError(f"{named_at}unknown task '{task}'; {nearest(task, [*task_names(), *study_names()])}")
 
 
 def _section(entry: Entry, source: str) -> Tree:

@@ -2,11 +2,11 @@
 
 import dataclasses
 import math
-import platform
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from functools import cached_property
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -14,18 +14,20 @@ import numpy as np
 import torch
 
 from telebip import __version__
-from telebip.config import TaskConfig, load_task
+from telebip.config import TaskConfig, load_task, to_yaml
 from telebip.control.factory import with_estimate
 from telebip.control.policy import Policy
 from telebip.env import TelebipEnv
 from telebip.errors import UserError, nearest
 from telebip.eval.conditions import SPEEDS, as_evaluated, forward_commands, on_flat_ground, trained_speeds
+from telebip.eval.energy import energy
 from telebip.eval.gait import summarise_gait
 from telebip.eval.learning import learning_curve
 from telebip.eval.omni import OmniProtocol, omni_results
 from telebip.eval.push import PushProtocol, push_limits
 from telebip.eval.terrain import TerrainProtocol, on_test_ground, terrain_results
 from telebip.eval.walk import heading_velocity, summarise
+from telebip.rl.run import machine_name, read_starts
 from telebip.robot import Robot
 from telebip.rollout import Rollout, roll_out
 from telebip.sim import Backend, choose_backend
@@ -90,9 +92,11 @@ def evaluate(
         "fingerprint": candidate.fingerprint,
         "telebip": __version__,
         "date": datetime.now().astimezone().isoformat(timespec="seconds"),
-        "machine": f"{platform.machine()}, {protocol.device}",
+        "machine": machine_name(protocol.device),
+        "device": str(protocol.device),
         "engine": choose_backend(protocol.backend, protocol.device),
         "protocol": _walking_protocol(candidate, protocol),
+        "training": _training(candidate),
     }
     if {"tracking", "gait"} & set(suites):
         walks = _walk(candidate, robot, protocol, progress)
@@ -111,6 +115,20 @@ def evaluate(
     if "learning" in suites:
         results["learning"] = curve
     return results
+
+
+def _training(candidate: Candidate) -> dict[str, Any] | None:
+    """Return how a policy was trained, as its run's folder tells it; None for what was not."""
+    if candidate.is_model_based or not candidate.run_dir:
+        return None
+    starts = read_starts(candidate.run_dir)
+    last = starts[-1] if starts else {}
+    task = sha256(to_yaml(dataclasses.replace(candidate.config, seed=0)).encode()).hexdigest()[:16]
+    return {
+        "seed": candidate.config.seed,
+        "task": task,
+        **{key: last.get(key) for key in ("processor", "arithmetic", "backend")},
+    }
 
 
 def _walking_protocol(candidate: Candidate, protocol: Protocol) -> dict[str, Any]:
@@ -197,6 +215,7 @@ def _tracking_row(command: float, rollout: Rollout, skip: float) -> dict[str, An
         "cot_article": round(s.cost_of_transport_article, 5),
         "cot_positive": round(s.cost_of_transport_positive, 5),
         "cot_joints": {name: round(cost, 5) for name, cost in zip(rollout.joint_names, s.joint_cost_of_transport, strict=True)},
+        "energy": energy(rollout.after(skip)),
     }
 
 

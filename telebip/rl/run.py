@@ -1,5 +1,6 @@
 """Run folders: where a training writes, and what it notes down about itself."""
 
+import contextlib
 import json
 import platform
 import shutil
@@ -12,12 +13,14 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import torch
 from filelock import FileLock, Timeout
 
 from telebip import ROOT, __version__
 from telebip.config import TaskConfig, to_yaml
 from telebip.errors import UserError
 from telebip.files import write_atomically
+from telebip.rl.networks import arithmetic
 
 PACKAGES = ("mujoco", "mujoco-warp", "warp-lang", "torch", "rsl-rl-lib", "numpy")
 
@@ -42,7 +45,7 @@ def create_run_dir(log_dir: Path, task: str) -> Path:
 
 
 def describe_run(run_dir: Path, config: TaskConfig, device: str, backend: str, processes: int = 1) -> None:
-    """Write `config.yaml`, complete, and append this start's versions, git revision and command line to `run.json`.
+    """Write `config.yaml`, complete, and append to `run.json` this start: command, machine, versions, git revision.
 
     Raises:
         UserError: `run.json` is damaged, or the folder cannot be written to.
@@ -51,6 +54,8 @@ def describe_run(run_dir: Path, config: TaskConfig, device: str, backend: str, p
         "time": datetime.now().astimezone().isoformat(timespec="seconds"),
         "command": sys.argv,
         "device": device,
+        "processor": machine_name(torch.device(device)),
+        "arithmetic": arithmetic(config.ppo.mixed_precision, torch.device(device)),
         "backend": backend,
         "processes": processes,
         **describe_code(),
@@ -142,3 +147,15 @@ def _git(*arguments: str) -> str | None:
     except (OSError, subprocess.SubprocessError):
         return None
     return done.stdout.strip()
+
+
+def machine_name(device: torch.device) -> str:
+    """Return what the device calls itself."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    with contextlib.suppress(OSError):  # Linux; elsewhere platform knows
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+        if names:
+            return names[0]
+    return platform.processor() or platform.machine()

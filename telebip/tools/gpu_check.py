@@ -28,13 +28,13 @@ from telebip.config import TaskConfig, load_task, task_names
 from telebip.env import TelebipEnv
 from telebip.graph import CudaGraph
 from telebip.rl.checkpoint import load_checkpoint
-from telebip.rl.run import describe_code
+from telebip.rl.run import describe_code, machine_name
 from telebip.rl.train import Trainer
 from telebip.robot import Robot, load_robot
 from telebip.sim import Backend
 from telebip.tools.benchmark import COLUMNS, measure
 from telebip.tools.engines import compiled_kernel_modules
-from telebip.tools.measuring import Stopwatch, machine_name
+from telebip.tools.measuring import Stopwatch
 from telebip.tools.sweep import train_once
 
 TERRAINS = ("telebip_rough", "telebip_omni")

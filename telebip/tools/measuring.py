@@ -1,11 +1,8 @@
-"""What measurements share: a stopwatch that suits the device, bytes, and what the machine calls itself."""
+"""What measurements share: a stopwatch that suits the device, and bytes."""
 
-import contextlib
 import gc
-import platform
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -59,15 +56,3 @@ def allocated_bytes(device: torch.device) -> int:
         covered += max(0, high - max(low, end))
         end = max(end, high)
     return covered
-
-
-def machine_name(device: torch.device) -> str:
-    """Return what the device calls itself."""
-    if device.type == "cuda":
-        return torch.cuda.get_device_name(device)
-    with contextlib.suppress(OSError):  # Linux; elsewhere platform knows
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-        if names:
-            return names[0]
-    return platform.processor() or platform.machine()

@@ -58,6 +58,10 @@ def test_tracking_measures_every_trained_command(results: dict[str, Any]) -> Non
         assert row["cot_mechanical"] < row["cot_article"] < row["cot_mechanical"] + 0.01
         assert 0.0 < row["cot_positive"] < row["cot_mechanical"]
         assert sum(row["cot_joints"].values()) == pytest.approx(row["cot_mechanical"], abs=1e-4)
+        assert sum(part["positive"] for part in row["energy"]) == pytest.approx(row["cot_positive"], abs=2e-4)
+        assert sum(part["positive"] + part["negative"] for part in row["energy"]) == pytest.approx(
+            row["cot_mechanical"], abs=2e-4
+        )
 
 
 def test_gait_and_pushes(results: dict[str, Any]) -> None:
