@@ -131,9 +131,10 @@ class TelebipEnv(VecEnv):
     def _bind_terms(self) -> None:
         """Give every term its parameters, memory and random numbers."""
         cfg, binder, self._delay = self.cfg, Binder(self.view()), None
-        if cfg.actions.delay[1] or cfg.actions.physics_delay[1]:
-            self._delay = DelayLine(cfg.actions.delay, cfg.actions.physics_delay, binder)
-            each = (cfg.sim.decimation,) if cfg.actions.physics_delay[1] else ()
+        delays = {name: getattr(cfg.actions, name) for name in ("delay", "physics_delay", "jitter", "loss")}
+        if any(most for most in (delays["delay"][1], delays["physics_delay"][1], delays["jitter"][1], delays["loss"])):
+            self._delay = DelayLine(binder, **delays)
+            each = (cfg.sim.decimation,) if delays["physics_delay"][1] or delays["jitter"][1] else ()
             self._targets = torch.zeros(self.num_envs, *each, self.num_actions, device=self.device)
         self.groups = {name: Group(name, group, binder) for name, group in cfg.observations.items()}
         self._rewards = {name: binder.bind("reward", "rewards", name, params) for name, params in cfg.rewards.items()}
@@ -152,6 +153,9 @@ class TelebipEnv(VecEnv):
             heading_hold=(cfg.commands.heading_gain, cfg.commands.heading_limit),
             velocity_hold=(cfg.commands.velocity_gain, cfg.commands.velocity_limit),
         )
+        self._encoders = self.state.memory.get("encoder_bias")
+        if self._encoders and not self._delay:
+            self._targets = torch.zeros_like(self.state.joint_target)
         self._random = binder.allocate()
         self.state.reset(self._everywhere())  # of what finding the sizes has left
         self.reward_names = tuple(self._rewards)
@@ -231,8 +235,11 @@ class TelebipEnv(VecEnv):
         self._finite.copy_(self._given.isfinite().all(1))
         self._action.copy_(self._given).masked_fill_(~self._finite[:, None], 0.0)
         state.joint_target.copy_(joint_targets(self._action, self.world.nominal, self.world.action_scale))
-        if self._delay:
-            self._targets.copy_(self._delay(step))
+        if self._delay or self._encoders:
+            self._targets.copy_(self._delay(step) if self._delay else state.joint_target)
+        if self._encoders:  # the motors' controllers, too, take the joints to be where these say
+            bias = self._encoders["bias"]
+            self._targets.sub_(bias if self._targets.dim() == 2 else bias[:, None])
         state.wrench_w.copy_(state.held_wrench_w)
         self._events.happen("step", step)
 
@@ -375,7 +382,7 @@ class TelebipEnv(VecEnv):
             before.start_qpos[:, :3] += self.world.ground.origin(self.state.tile)
         self.sim.reset(mask, before.start_qpos, before.start_qvel)
         step = self.view()
-        torch.where(mask, step.heading, reference, out=reference)
+        torch.where(mask, step.measured.heading, reference, out=reference)
         self._commands.update(step)
         return step
 

@@ -40,6 +40,25 @@ def rotate_inverse(quat: Tensor, vec: Tensor) -> Tensor:
     return (vec - w * t + torch.linalg.cross(u, t, dim=0)).movedim(0, -1)
 
 
+def multiply(first: Tensor, second: Tensor) -> Tensor:
+    """Return the product of the quaternions `first` and `second` (..., 4): turned by `second` as seen from `first`."""
+    (w, x, y, z), (a, b, c, d) = first.unbind(-1), second.unbind(-1)
+    product = [
+        w * a - x * b - y * c - z * d,
+        w * b + x * a + y * d - z * c,
+        w * c - x * d + y * a + z * b,
+        w * d + x * c - y * b + z * a,
+    ]
+    return torch.stack(product).movedim(0, -1)
+
+
+def small_rotation(angles: Tensor) -> Tensor:
+    """Return the unit quaternion (1, angles / 2), normalised, of small `angles` [rad] about x, y and z (..., 3); (..., 4)."""
+    half = 0.5 * angles.movedim(-1, 0)
+    quat = torch.cat([torch.ones_like(half[:1]), half])
+    return (quat / quat.square().sum(0).sqrt()).movedim(0, -1)
+
+
 def matrix(quat: Tensor) -> Tensor:
     """Return the rotation matrix, body to world, of the unit `quat` (..., 4); (..., 3, 3)."""
     w, x, y, z = quat.unbind(-1)

@@ -50,6 +50,8 @@ class ActionsConfig:
     scale: Annotated[dict[str, float], Quantity("rad | m", gt=0)]
     delay: Annotated[tuple[int, int], Quantity("policy steps", ge=0, le=100)]
     physics_delay: Annotated[tuple[int, int], Quantity("physics steps", ge=0, le=1000)]
+    jitter: Annotated[tuple[int, int], Quantity("physics steps", ge=0, le=1000)]
+    loss: Annotated[float, Quantity(ge=0, lt=1)]
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from telebip.errors import UserError
 from telebip.mdp.random_numbers import RandomNumbers, Ranges
 from telebip.mdp.step import Memory, Step
 from telebip.mdp.term import Kind, ObservationGroup, Params, Term, find
@@ -56,7 +57,9 @@ class Binder:
         keywords, name = own(term, params), f"{section}.{entry}"
         more: list[Any] = []
         if term.memory:
-            more.append(self.memory(name, term.memory(world, **keywords)))
+            if term.memory_name in self.step.env.memory:
+                raise UserError(f"{name}: there is a '{term.name}' already, and it can be there once")
+            more.append(self.memory(term.memory_name or name, term.memory(world, **keywords)))
         if term.random:
             more.append(self.random(name, term.random(world, **keywords)))
         return lambda *arguments: term.function(*arguments, *more, **keywords)

@@ -64,7 +64,7 @@ class VelocityCommands:
         gain, limit = self._velocity_hold
         if gain:
             lag = self._memory["lag"]
-            lag += world.step_dt * (state.target_command[:, :2] - step.base_lin_vel_b[:, :2])
+            lag += world.step_dt * (state.target_command[:, :2] - step.measured.base_lin_vel_b[:, :2])
             lag.clamp_(-limit / gain, limit / gain)  # else it would have to be made up for after every change
 
     def update(self, step: Step) -> None:
@@ -85,7 +85,8 @@ class VelocityCommands:
     def hold(self, step: Step) -> None:
         """Bend the target commands towards the reference heading and the way to go: what the policies see."""
         state = step.env
-        held = hold_heading(state.target_command, step.heading, state.reference_heading, *self._heading_hold)
+        heading = step.measured.heading  # what the robot takes for its own
+        held = hold_heading(state.target_command, heading, state.reference_heading, *self._heading_hold)
         if "lag" in self._memory:
             held = hold_velocity(held, self._memory["lag"], *self._velocity_hold)
         state.command.copy_(held)

@@ -150,28 +150,49 @@ def friction(step: Step, mask: Tensor, random: Random, *, range: Annotated[tuple
     torch.where(mask, random["friction"][:, 0].to(value.dtype), value, out=value)
 
 
-@event("reset", "once", random=lambda world, *, scale, **_: {"mass": [scale]}, fields=lambda **_: ("body_mass", "body_inertia"))
-def mass(step: Step, mask: Tensor, random: Random, *, scale: Scale, bodies: list[str] | None = None) -> None:
-    """Scale the mass and the inertia of bodies, all by one factor: those named, or the whole robot."""
-    for field in ("body_mass", "body_inertia"):
-        rows = rows_of(step.world, field, bodies)
-        value = nominal(step.world, field, rows)
-        write(step.world, field, rows, random["mass"].view(-1, *[1] * value.dim()) * value, mask)
+def _mass_random(world: World, *, scale: tuple[float, float], inertia: tuple[float, float], bodies: list[str] | None) -> Ranges:
+    number = len(nominal(world, "body_mass", rows_of(world, "body_mass", bodies)))
+    return {"mass": [scale] * number, "inertia": [inertia] * number}
 
 
-@event(
-    "reset",
-    "once",
-    random=lambda world, *, kp, kv: {"gains": [kp, kv]},
-    fields=lambda **_: ("actuator_gainprm", "actuator_biasprm"),
-)
+@event("reset", "once", random=_mass_random, fields=lambda **_: ("body_mass", "body_inertia"))
+def mass(
+    step: Step, mask: Tensor, random: Random, *, scale: Scale, inertia: Scale = (1.0, 1.0), bodies: list[str] | None = None
+) -> None:
+    """Scale mass and inertia of each body, those named or all, by a factor of its own; with `inertia`, that by another one too.
+
+    With one factor, the body is of another density; `inertia` tells that the mass lies elsewhere in it.
+    """
+    rows = rows_of(step.world, "body_mass", bodies)
+    factor = random["mass"]
+    write(step.world, "body_mass", rows, factor * nominal(step.world, "body_mass", rows), mask)
+    factor = (factor * random["inertia"])[:, :, None]
+    write(step.world, "body_inertia", rows, factor * nominal(step.world, "body_inertia", rows), mask)
+
+
+def _com_random(world: World, *, offset: float, bodies: list[str]) -> Ranges:
+    return {"offset": _symmetric(3 * len(bodies), offset)}
+
+
+@event("reset", "once", random=_com_random, fields=lambda **_: ("body_ipos",))
+def com(step: Step, mask: Tensor, random: Random, *, offset: Annotated[float, Quantity("m", ge=0)], bodies: list[str]) -> None:
+    """Move the centre of mass of each of these bodies, uniform within +- `offset` on each axis of its frame."""
+    rows = rows_of(step.world, "body_ipos", bodies)
+    moved = random["offset"].unflatten(1, (-1, 3)) + nominal(step.world, "body_ipos", rows)
+    write(step.world, "body_ipos", rows, moved, mask)
+
+
+def _gains_random(world: World, *, kp: tuple[float, float], kv: tuple[float, float]) -> Ranges:
+    return {"kp": [kp] * world.sim.model.nu, "kv": [kv] * world.sim.model.nu}
+
+
+@event("reset", "once", random=_gains_random, fields=lambda **_: ("actuator_gainprm", "actuator_biasprm"))
 def gains(step: Step, mask: Tensor, random: Random, *, kp: Scale, kv: Scale) -> None:
-    """Scale the stiffness kp and the damping kv of all position actuators, each by one factor."""
-    kp_factor, kv_factor = random["gains"].split(1, dim=1)
+    """Scale the stiffness kp and the damping kv of each position actuator, each by a factor of its own."""
     for field, column, factor in (
-        ("actuator_gainprm", 0, kp_factor),
-        ("actuator_biasprm", 1, kp_factor),
-        ("actuator_biasprm", 2, kv_factor),
+        ("actuator_gainprm", 0, random["kp"]),
+        ("actuator_biasprm", 1, random["kp"]),
+        ("actuator_biasprm", 2, random["kv"]),
     ):
         index = slice(None), column
         write(step.world, field, index, factor * nominal(step.world, field, index), mask)
@@ -238,3 +259,89 @@ def kick(
     live = step.world.sim.memory["qvel"]
     live[:, :6] += random["kick"].masked_fill(~mask[:, None], 0.0)
     step.state.qvel.copy_(live)
+
+
+def _encoder_random(world: World, *, hinge: float, slide: float) -> Ranges:
+    amplitudes = [slide if is_slide else hinge for is_slide in world.robot.is_slide]
+    return {"bias": [(-amplitude, amplitude) for amplitude in amplitudes]}
+
+
+@event(
+    "reset",
+    random=_encoder_random,
+    memory=lambda world, **_: {"bias": world.zeros(world.num_joints)},
+    memory_name="encoder_bias",
+)
+def encoder_bias(
+    step: Step,
+    mask: Tensor,
+    memory: Memory,
+    random: Random,
+    *,
+    hinge: Annotated[float, Quantity("rad", ge=0)],
+    slide: Annotated[float, Quantity("m", ge=0)],
+) -> None:
+    """Let every encoder be off by a constant, uniform within +- `hinge` or +- `slide` by the kind of its joint.
+
+    Policy and motor controller read the same encoder: the one sees q + b, and the other's torque is
+    kp (q_target - (q + b)) - kv qd, so that the engine is given q_target - b.
+    """
+    _draw(memory["bias"], random["bias"], mask)
+
+
+@event(
+    "reset",
+    random=lambda world, *, angle: {"angles": _symmetric(3, angle)},
+    memory=lambda world, **_: {"angles": world.zeros(3)},
+    memory_name="imu_orientation",
+)
+def imu_orientation(
+    step: Step, mask: Tensor, memory: Memory, random: Random, *, angle: Annotated[float, Quantity("rad", ge=0, le=1)]
+) -> None:
+    """Mount the inertial measurement unit askew, by up to +- `angle` about each axis of the trunk; see `Measured`."""
+    _draw(memory["angles"], random["angles"], mask)
+
+
+@event(
+    "reset",
+    random=lambda world, *, rate: {"bias": _symmetric(3, rate)},
+    memory=lambda world, **_: {"bias": world.zeros(3)},
+    memory_name="gyro_bias",
+)
+def gyro_bias(
+    step: Step, mask: Tensor, memory: Memory, random: Random, *, rate: Annotated[float, Quantity("rad/s", ge=0)]
+) -> None:
+    """Let the gyro be off by a constant, uniform within +- `rate` on each axis: so does the heading drift, see `Measured`."""
+    _draw(memory["bias"], random["bias"], mask)
+
+
+@event(
+    "step",
+    random=lambda world, **_: {"noise": _symmetric(2, 1.0)},
+    memory=lambda world, **_: {"angles": world.zeros(3)},
+    memory_name="attitude_error",
+)
+def attitude_error(
+    step: Step,
+    mask: Tensor,
+    memory: Memory,
+    random: Random,
+    *,
+    tilt: Annotated[float, Quantity("rad", ge=0, le=1)],
+    time: Annotated[float, Quantity("s", gt=0)],
+) -> None:
+    r"""Let roll and pitch that the attitude filter tells wander about the truth, as accelerations disturb its sense of gravity.
+
+        e_0 = 0,    e_t = rho e_{t-1} + tilt sqrt(3 (1 - rho^2)) u,    rho = exp(-dt / time),    u uniform in -1..1
+
+    on each of the two axes: a Gauss-Markov process (Brown and Hwang, Introduction to Random Signals, section 4.5) of standard
+    deviation `tilt` [rad] and correlation time `time` [s].
+    """
+    rho = math.exp(-step.world.step_dt / time)
+    angles = memory["angles"][:, :2]
+    angles.mul_(rho).add_(random["noise"], alpha=tilt * math.sqrt(3.0 * (1.0 - rho * rho)))
+
+
+def _draw(value: Tensor, drawn: Tensor, mask: Tensor) -> None:
+    """Write new numbers (num_envs, size) in the worlds where `mask` holds."""
+    torch.where(mask[:, None], drawn, value, out=value)

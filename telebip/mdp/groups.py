@@ -36,7 +36,8 @@ class Group:
     """One vector of observations of every world.
 
     With a `history` of N it is the latest N frames, the newest first, and with a `delay` they are that many policy steps old;
-    where an episode is younger than that, its first frame stands for those before.
+    where an episode is younger than that, its first frame stands for those before. With a `loss`, that share of the frames
+    keeps what the sensors told in the frame before. Without `noise`, the truth is seen: no noise, and no errors of the sensors.
     """
 
     def __init__(self, name: str, cfg: ObservationGroup, binder: Binder) -> None:
@@ -48,15 +49,20 @@ class Group:
             _part(f"{section}.{entry}", entry, params, cfg.noise, term, binder.step)
             for term, (entry, params) in zip(self._terms, cfg.terms.items(), strict=True)
         ]
+        self._shows_truth, self._loss = not cfg.noise, cfg.loss
         self.frame_size = sum(part.size for part in self.parts)
         self.size = cfg.history * self.frame_size
         self._has_noise = any(part.noise for part in self.parts)
         noise = [(-part.noise, part.noise) for part in self.parts for _ in range(part.size)]
+        is_sensed = [find_term("observation", *item).is_sensed for item in cfg.terms.items()]
+        sensed = [yes for yes, part in zip(is_sensed, self.parts, strict=True) for _ in range(part.size)]
+        self._is_sensed = torch.tensor(sensed, device=world.device)
         late = [(cfg.delay[0], cfg.delay[1] + 1)] if cfg.delay[1] else []
-        self._random = binder.random(section, {"noise": noise if self._has_noise else [], "delay": late})
+        lost = [(0.0, 1.0)] if cfg.loss else []
+        self._random = binder.random(section, {"noise": noise if self._has_noise else [], "delay": late, "loss": lost})
         kept = cfg.history + cfg.delay[1]
         frames = {"frames": world.zeros(kept * self.frame_size), "age": world.zeros()}
-        self._memory = binder.memory(section, frames) if kept > 1 else None
+        self._memory = binder.memory(section, frames) if kept > 1 or cfg.loss else None
 
     def layout(self) -> list[dict[str, Any]]:
         """Return what each part of a frame is, as plain data."""
@@ -70,13 +76,17 @@ class Group:
 
     def observe(self, step: Step) -> Tensor:
         """Return what is seen now, (num_envs, size); seen twice in a step, it is the same."""
-        frame = columns(*(term(step) for term in self._terms))
+        seen_as = step if self._shows_truth else step.measured
+        frame = columns(*(term(seen_as) for term in self._terms))
         if self._has_noise:
             frame += self._random["noise"]
         if not self._memory:
             return frame.contiguous()  # by rows, as everyone expects
         frames, size = self._memory["frames"], self.frame_size
         kept = frames.shape[1] // size
+        if self._loss:
+            is_lost = (self._random["loss"] < self._loss) & self._is_sensed & ~step.is_new[:, None]
+            frame = torch.where(is_lost, frames[:, :size], frame)
         frames[:, :size] = frame
         frames.copy_(torch.where(step.is_new[:, None], frame.repeat(1, kept), frames))
         if not self._delay[1]:

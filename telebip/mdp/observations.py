@@ -9,6 +9,8 @@ from typing import Annotated, Literal
 import torch
 from torch import Tensor
 
+from telebip.errors import UserError, nearest
+from telebip.mdp.fields import rows_of
 from telebip.mdp.step import Step
 from telebip.mdp.term import Image, Quantity, observation
 from telebip.robot import FLOOR
@@ -17,7 +19,7 @@ from telebip.robot import FLOOR
 @observation(unit="rad | m, relative to the nominal pose", mirror="joints")
 def joint_pos(step: Step) -> Tensor:
     """Joint positions, relative to the nominal pose [rad | m], (num_envs, num_joints)."""
-    return step.state.joint_pos - step.world.nominal
+    return step.joint_pos - step.world.nominal
 
 
 @observation(unit="rad/s | m/s", mirror="joints")
@@ -26,7 +28,7 @@ def joint_vel(step: Step) -> Tensor:
     return step.state.joint_vel
 
 
-@observation(unit="output of the previous step", mirror="joints")
+@observation(unit="output of the previous step", mirror="joints", is_sensed=False)
 def last_action(step: Step) -> Tensor:
     """The previous action [-], (num_envs, num_joints)."""
     return step.last_action
@@ -56,13 +58,13 @@ def projected_gravity(step: Step) -> Tensor:
     return step.projected_gravity
 
 
-@observation(unit="m/s forward, m/s left, rad/s", mirror="command")
+@observation(unit="m/s forward, m/s left, rad/s", mirror="command", is_sensed=False)
 def command(step: Step) -> Tensor:
     """The command (vx, vy, yaw rate), the heading hold's correction included [m/s, m/s, rad/s], (num_envs, 3)."""
     return step.command
 
 
-@observation(unit="sin(2 pi t / gait_period) and its negative, t since the start", mirror="feet")
+@observation(unit="sin(2 pi t / gait_period) and its negative, t since the start", mirror="feet", is_sensed=False)
 def phase(step: Step) -> Tensor:
     """Phase signals (p_r, p_l) [-], (num_envs, 2)."""
     return step.phase
@@ -144,3 +146,39 @@ def sensor(step: Step, *, sensor: str, mirror: Literal["polar", "axial", "quat",
         mirror: what it measures, for `ppo.symmetry`; "none" if it has no mirror image.
     """
     return step.state.sensors[sensor]
+
+
+@observation(unit="s, until an action reaches the motors", mirror="same")
+def action_delay(step: Step) -> Tensor:
+    """By how much the episode's actions are late, without jitter [s], (num_envs, 1)."""
+    memory = step.env.memory.get("actions")
+    late = memory["delay"] if memory else step.world.zeros()
+    return late[:, None] * (step.world.step_dt / step.world.decimation)
+
+
+@observation(unit="as the MJCF's", mirror=lambda *, field, names, column, mirror: mirror)
+def model_value(
+    step: Step,
+    *,
+    field: str,
+    names: list[str] | None = None,
+    column: int | None = None,
+    mirror: Literal["polar", "feet", "same", "none"] = "none",
+) -> Tensor:
+    """A field of MuJoCo's model in each world, less the MJCF's value: what an event has drawn, for a critic, (num_envs, size).
+
+    Args:
+        step: the present step.
+        field: as in `mujoco.MjModel`, one that an event changes.
+        names: of the bodies, joints, geoms, sites or actuators; all if not given.
+        column: which number of each row, where it has several; all if not given.
+        mirror: what it is, for `ppo.symmetry`; "none" if it has no mirror image.
+
+    Raises:
+        UserError: no event changes the field.
+    """
+    if field not in step.world.sim.model_fields:
+        raise UserError(f"no event changes '{field}'; {nearest(field, step.world.sim.model_fields)}")
+    rows = rows_of(step.world, field, names)
+    index = (slice(None), rows) if column is None else (slice(None), rows, column)
+    return (step.world.sim.model_fields[field][index] - step.world.nominal_fields[field][index[1:]]).flatten(1).float()

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from telebip.math import columns, over, rotate_inverse, turn, yaw, zeros
+from telebip.math import columns, multiply, over, rotate_inverse, small_rotation, turn, yaw, zeros
 from telebip.mdp.gait import phase_signals
 from telebip.mdp.ground import Ground
 from telebip.robot import Robot
@@ -146,6 +146,11 @@ class Step:
         self.state: SimState = world.sim.state
 
     @cached_property
+    def measured(self) -> "Step":
+        """The same step as the robot's sensors tell it, see `Measured`; itself where no event gives them errors."""
+        return Measured(self) if Measured.ERRORS & self.env.memory.keys() else self
+
+    @cached_property
     def fallen(self) -> Tensor:
         """Whether the episode ends here by a termination or a fault, bool, (num_envs,); set before rewards are called."""
         return torch.zeros_like(self.env.has_begun)
@@ -190,6 +195,16 @@ class Step:
         """Return the height of the ground at points of the world [m], (...)."""
         return self.world.ground.height(x, y) if self.world.ground else torch.zeros_like(x)
 
+    @property
+    def joint_pos(self) -> Tensor:
+        """Positions of the actuated joints [rad | m], (num_envs, num_joints)."""
+        return self.state.joint_pos
+
+    @property
+    def base_quat(self) -> Tensor:
+        """Orientation of the trunk in the world, w x y z, (num_envs, 4)."""
+        return self.state.base_quat
+
     @cached_property
     def base_lin_vel_b(self) -> Tensor:
         """Velocity of the trunk's frame, body frame [m/s], (num_envs, 3)."""
@@ -203,7 +218,7 @@ class Step:
     @cached_property
     def projected_gravity(self) -> Tensor:
         """Unit vector of gravity, body frame: (0, 0, -1) where the trunk is upright [-], (num_envs, 3)."""
-        w, x, y, z = self.state.base_quat.unbind(1)
+        w, x, y, z = self.base_quat.unbind(1)
         return torch.stack([2.0 * (w * y - x * z), -2.0 * (w * x + y * z), 2.0 * (x * x + y * y) - 1.0]).T
 
     @cached_property
@@ -219,7 +234,7 @@ class Step:
     @cached_property
     def heading(self) -> Tensor:
         """Heading of the trunk in the world [rad], (num_envs,)."""
-        return yaw(self.state.base_quat)
+        return yaw(self.base_quat)
 
     @cached_property
     def heading_lin_vel(self) -> Tensor:
@@ -236,7 +251,7 @@ class Step:
         It equals the article's base quaternion where the robot starts facing x and walks straight, and does not tell the
         policy which way x points. q and -q are the same rotation and give the same result.
         """
-        quat = turn(self.state.base_quat, -self.env.reference_heading)
+        quat = turn(self.base_quat, -self.env.reference_heading)
         return torch.where(quat[:, :1] < 0.0, -quat, quat)
 
     def is_due(self, timer: Tensor, interval: Tensor) -> Tensor:
@@ -256,3 +271,55 @@ class Step:
     def push_force(self, force_w: Tensor) -> None:
         """Let a force (num_envs, 2) or (num_envs, 3) [N], world frame, act on the trunk's centre of mass in the coming step."""
         self.env.wrench_w[:, : force_w.shape[1]] += force_w
+
+
+class Measured(Step):
+    r"""The step as a robot's sensors tell it, with the errors that events have drawn (`telebip.mdp.events`).
+
+        joint_pos      q + b                                            encoder_bias: b
+        base_ang_vel   R(q_imu)^T w + b_g                               imu_orientation: q_imu, gyro_bias: b_g
+        base_lin_vel   R(q_imu)^T v
+        base_quat      q_z(b_g,z t) q q_imu q_f                         attitude_error: q_f
+
+    The heading is the gyro's integral, which nothing corrects: to first order in the tilt it drifts by the bias about z, since
+    the start of the episode. Roll and pitch are corrected by gravity; what is left is q_f. What follows from the orientation,
+    projected gravity and heading, follows from the measured one. All else is as it is.
+    """
+
+    ERRORS = frozenset(("encoder_bias", "imu_orientation", "gyro_bias", "attitude_error"))
+    """Names in `EnvState.memory`."""
+
+    def __init__(self, true: Step) -> None:
+        """Measure `true`."""
+        super().__init__(true.world, true.env, true.action)
+        self._true = true
+
+    @cached_property
+    def joint_pos(self) -> Tensor:
+        """Positions of the actuated joints [rad | m], (num_envs, num_joints)."""
+        error = self.env.memory.get("encoder_bias")
+        return self._true.joint_pos + error["bias"] if error else self._true.joint_pos
+
+    @cached_property
+    def base_ang_vel_b(self) -> Tensor:
+        """Angular velocity in the sensor's frame [rad/s], (num_envs, 3)."""
+        value, error = self._in_sensor_frame(self._true.base_ang_vel_b), self.env.memory.get("gyro_bias")
+        return value + error["bias"] if error else value
+
+    @cached_property
+    def base_lin_vel_b(self) -> Tensor:
+        """Velocity of the trunk's frame, in the sensor's frame [m/s], (num_envs, 3)."""
+        return self._in_sensor_frame(self._true.base_lin_vel_b)
+
+    @cached_property
+    def base_quat(self) -> Tensor:
+        """Orientation that the attitude filter tells, w x y z, (num_envs, 4)."""
+        quat, memory = self._true.base_quat, self.env.memory
+        for name in ("imu_orientation", "attitude_error"):
+            if name in memory:
+                quat = multiply(quat, small_rotation(memory[name]["angles"]))
+        return turn(quat, memory["gyro_bias"]["bias"][:, 2] * self.time) if "gyro_bias" in memory else quat
+
+    def _in_sensor_frame(self, vector_b: Tensor) -> Tensor:
+        error = self.env.memory.get("imu_orientation")
+        return rotate_inverse(small_rotation(error["angles"]), vector_b) if error else vector_b

@@ -67,11 +67,13 @@ class Term:
     kind: Kind
     function: Callable[..., Any]
     memory: Callable[..., Mapping[str, Any]] | None = None  # (world, **parameters) -> tensors
+    memory_name: str = ""  # under which others find it in `EnvState.memory`; else it is the entry's own
     random: Callable[..., Mapping[str, list[tuple[float, float]]]] | None = None  # (world, **parameters) -> ranges
     unit: str = ""  # of an observation
     mirror: Mirror | Callable[..., Mirror | Image] = "none"  # of an observation, or (**parameters) -> that
     sensors: Callable[..., tuple[str, ...]] | None = None  # of an observation: (**parameters) -> sensors of the MJCF
     when: tuple[When, ...] = ()  # of an event: when it may happen, the usual one first
+    is_sensed: bool = True  # of an observation: whether a sensor measures it, so that a frame may get lost
     fields: Callable[..., tuple[str, ...]] | None = None  # of an event: (**parameters) -> fields of the model that it writes
     is_disturbance: bool = False  # of an event: left out where a policy is measured undisturbed
     own_parameters: dict[str, Parameter] = field(init=False)  # of the function
@@ -134,7 +136,8 @@ class ObservationGroup:
     terms: dict[str, Params]
     history: Annotated[int, Quantity("policy steps", ge=1, le=1000)] = 1  # how many of the latest are seen, the newest first
     delay: Annotated[tuple[int, int], Quantity("policy steps", ge=0, le=100)] = (0, 0)  # uniform per world and episode
-    noise: bool = True  # whether the terms' noise is on
+    noise: bool = True  # whether it sees what the sensors tell, with the terms' noise and the events' errors, or the truth
+    loss: Annotated[float, Quantity(ge=0, le=1)] = 0.0  # share of frames whose sensors' part does not come: the last one holds
 
 
 TERMS: dict[Kind, dict[str, Term]] = {"observation": {}, "reward": {}, "termination": {}, "event": {}, "terrain": {}}
@@ -165,7 +168,8 @@ def termination(function: Callable[..., Any] | None = None, /, **about: Any) -> 
 def observation(function: Callable[..., Any] | None = None, /, **about: Any) -> Any:
     """Let tasks name a function (step, **parameters) -> (num_envs, size) in a group of their `observations`.
 
-    `unit` tells what its numbers are, `mirror` how they are mirrored (see `telebip.mdp.mirror`), for `ppo.symmetry`.
+    `unit` tells what its numbers are, `mirror` how they are mirrored (see `telebip.mdp.mirror`), for `ppo.symmetry`. What the
+    policy's computer knows by itself has `is_sensed=False`.
     """
     return _enter("observation", function, about)
 
@@ -177,7 +181,7 @@ def event(*when: When, **about: Any) -> Callable[[Callable[..., Any]], Callable[
         when: "reset", in the worlds that begin an episode; "end", in those that end one, before anything is reset; "once",
             in all worlds, as they are made; "interval", in the worlds whose time has come, every `interval` [s] of a range;
             "step", in all worlds, before each step. With several, the YAML's `when` chooses.
-        about: `memory`, `random`, `fields` and `is_disturbance` of `Term`.
+        about: `memory`, `memory_name`, `random`, `fields` and `is_disturbance` of `Term`.
     """
     return lambda function: _enter("event", function, {"when": when, "is_disturbance": True, **about})
 
@@ -191,7 +195,7 @@ def _enter(kind: Kind, function: Callable[..., Any] | None, about: dict[str, Any
     if function is None:
         return lambda function: _enter(kind, function, about)
     known = TERMS[kind].get(function.__name__)
-    if kind == "observation" and function.__name__ in ("history", "delay", "noise"):
+    if kind == "observation" and function.__name__ in ("history", "delay", "loss", "noise"):
         raise ValueError(f"an observation cannot be called '{function.__name__}', as a group has a field of this name")
     if known and (known.function.__module__, known.function.__qualname__) != (function.__module__, function.__qualname__):
         raise ValueError(f"there is a {kind} called '{function.__name__}' already, in {known.function.__module__}")

@@ -37,7 +37,7 @@ def test_every_joint_has_a_scale_and_every_scale_a_joint() -> None:
 def delayed(step: Step, delay: tuple[int, int], physics_delay: tuple[int, int], ages: list[int]) -> list[Tensor]:
     """What the engine is given in steps of these ages, relative to the nominal pose, if the target of step t is t + 1."""
     binder = Binder(step)
-    line = DelayLine(delay, physics_delay, binder)
+    line = DelayLine(binder, delay, physics_delay)
     draws = binder.allocate()
     generator, given = torch.Generator().manual_seed(0), []
     for t, age in enumerate(ages):

@@ -189,27 +189,43 @@ def test_friction_is_the_sliding_friction_of_the_ground(robot: Robot) -> None:
 
 
 @pytest.mark.parametrize("bodies", [None, ["trunk"], ["right_shank", "trunk"]])
-def test_mass_and_inertia_are_scaled_by_one_factor(robot: Robot, bodies: list[str] | None) -> None:
+@pytest.mark.parametrize("inertia", [(1.0, 1.0), (0.6, 0.8)])
+def test_mass_and_inertia_are_scaled_by_a_factor_for_each_body(
+    robot: Robot, bodies: list[str] | None, inertia: tuple[float, float]
+) -> None:
     step = make_step(robot, 8, fields=FIELDS)
-    written = changed(step, "mass", scale=(0.5, 2.0), bodies=bodies)
+    written = changed(step, "mass", scale=(0.5, 2.0), inertia=inertia, bodies=bodies)
     heavy = [robot.model.body(name).id for name in bodies or [robot.model.body(i).name for i in range(1, robot.model.nbody)]]
-    factor = written["body_mass"][:, heavy[0]] / nominal(step, "body_mass")[heavy[0]]
-    assert len(factor.unique()) == 4
+    factor = written["body_mass"][:, heavy] / nominal(step, "body_mass")[heavy]
+    assert len(factor.unique()) == 4 * len(heavy)
     assert ((factor > 0.5) & (factor < 2.0)).all()
+    about = written["body_inertia"][:, heavy] / nominal(step, "body_inertia")[heavy] / factor[:, :, None]
+    torch.testing.assert_close(about, about[:, :, :1].expand_as(about))  # on all axes alike
+    assert (about > inertia[0] - 1e-6).all() and (about < inertia[1] + 1e-6).all()
+    assert len(about[:, :, 0].round(decimals=5).unique()) == (4 * len(heavy) if inertia[0] < inertia[1] else 1)
+    others = [i for i in range(robot.model.nbody) if i not in heavy]
     for field in ("body_mass", "body_inertia"):
-        expected = nominal(step, field).repeat(4, *[1] * nominal(step, field).dim())
-        expected[:, heavy] *= factor.view(-1, *[1] * (expected.dim() - 1))
-        torch.testing.assert_close(written[field], expected)
+        assert torch.equal(written[field][:, others], nominal(step, field)[others].expand_as(written[field][:, others]))
 
 
-def test_gains_scale_stiffness_and_damping_each_by_one_factor(robot: Robot) -> None:
+@pytest.mark.parametrize("bodies", [["trunk"], ["right_shank", "trunk"]])
+def test_the_centre_of_mass_of_a_body_is_moved_on_each_axis(robot: Robot, bodies: list[str]) -> None:
+    step = make_step(robot, 4096, fields=FIELDS)
+    bind(step, "event", "com", offset=0.03, bodies=bodies)(step, everywhere(step))
+    moved = step.world.sim.model_fields["body_ipos"] - nominal(step, "body_ipos")
+    rows = [robot.model.body(name).id for name in bodies]
+    fills(moved[:, rows].flatten(1), -0.03, 0.03)
+    moved[:, rows] = 0.0
+    assert not moved.any()
+
+
+def test_gains_scale_stiffness_and_damping_of_each_actuator_by_factors_of_its_own(robot: Robot) -> None:
     step = make_step(robot, 8, fields=FIELDS)
     written = changed(step, "gains", kp=(0.8, 1.2), kv=(0.5, 0.7))
     kp = written["actuator_gainprm"][:, :, 0] / nominal(step, "actuator_gainprm")[:, 0]
     kv = written["actuator_biasprm"][:, :, 2] / nominal(step, "actuator_biasprm")[:, 2]
     for factor, low, high in ((kp, 0.8, 1.2), (kv, 0.5, 0.7)):
-        torch.testing.assert_close(factor, factor[:, :1].expand_as(factor))
-        assert len(factor[:, 0].unique()) == 4
+        assert len(factor.unique()) == factor.numel() == 24
         assert ((factor >= low) & (factor <= high)).all()
     # tau = kp (q_target - q) - kv qd: the gain and the bias have the same kp.
     assert torch.equal(written["actuator_biasprm"][:, :, 1], -written["actuator_gainprm"][:, :, 0])
