@@ -166,9 +166,10 @@ NAMED = (
     [
         ("telebip_flat", EVENTFUL),
         ("telebip_flat", (*MORE_EVENTFUL, *NAMED)),
+        ("telebip_real", ("episode.length=0.1",)),
         ("tests/robots/four_joints.yaml", ()),
     ],
-    ids=["eventful", "more eventful", "joints that do not lie side by side"],
+    ids=["eventful", "more eventful", "all that is randomised", "joints that do not lie side by side"],
 )
 def test_a_step_brings_nothing_new_from_the_host(task: str, overrides: tuple[str, ...]) -> None:
     """As a list as an index or torch.tensor would, which no recording on CUDA can: all that is there was there before."""

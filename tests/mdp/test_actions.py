@@ -90,3 +90,50 @@ def test_delays_are_drawn_once_per_world_and_episode(robot: Robot) -> None:
             torch.testing.assert_close(episode[age], expected, atol=1e-6, rtol=0.0)
     first, second = given[5], given[11] - 6.0
     assert not torch.equal(first.round(), second.round())
+
+
+def arrivals(due: list[int | None], steps: int) -> list[list[int]]:
+    """What is held at each physics step if the target of step t is t + 1 and arrives in physics step `due[t]`, or never."""
+    held = []
+    for substep in range(4 * steps):
+        there = [t + 1 for t, time in enumerate(due) if time is not None and time <= substep]
+        held.append(max(there, default=0))
+    return [held[4 * t : 4 * t + 4] for t in range(steps)]
+
+
+def test_jitter_lets_the_newest_target_that_has_arrived_be_held_and_loss_keeps_the_one_before(robot: Robot) -> None:
+    worlds, steps = 64, 40
+    step = make_step(robot, worlds)
+    binder = Binder(step)
+    line = DelayLine(binder, delay=(0, 1), physics_delay=(1, 3), jitter=(0, 6), loss=0.2)
+    draws, generator, given = binder.allocate(), torch.Generator().manual_seed(0), []
+    late: list[list[int | None]] = [[] for _ in range(worlds)]
+    for t in range(steps):
+        draws.draw(generator)
+        step.env.joint_target.copy_((step.world.nominal + t + 1.0).expand_as(step.env.joint_target))
+        given.append(line(again(step, t)) - step.world.nominal)
+        jitter, is_lost = draws.part("actions.jitter").floor(), draws.part("actions.loss") < 0.2
+        for world in range(worlds):
+            delay = int(step.env.memory["actions"]["delay"][world] + jitter[world, 0])
+            late[world].append(None if is_lost[world, 0] else 4 * t + delay)
+    held = torch.stack(given)  # (steps, worlds, 4, joints)
+    for world in range(worlds):
+        expected = torch.tensor(arrivals(late[world], steps)).float()
+        torch.testing.assert_close(held[:, world], expected[:, :, None].expand(-1, -1, 6), atol=1e-5, rtol=0.0)
+    lost = sum(time is None for times in late for time in times) / (worlds * steps)
+    assert lost == pytest.approx(0.2, abs=0.03)
+    jitters = {time - 4 * t for times in late[:1] for t, time in enumerate(times) if time is not None}
+    assert max(jitters) - min(jitters) == 6
+
+
+def test_actions_that_are_lost_without_a_delay_are_those_before(robot: Robot) -> None:
+    step = make_step(robot, 512)
+    binder = Binder(step)
+    line = DelayLine(binder, loss=0.5)
+    draws = binder.allocate()
+    draws.draw(torch.Generator().manual_seed(0))
+    step.env.joint_target.copy_((step.world.nominal + 1.0).expand_as(step.env.joint_target))
+    given = line(again(step, 0)) - step.world.nominal
+    assert given.shape == (512, 6)
+    assert given.mean().item() == pytest.approx(0.5, abs=0.08)
+    assert set(given[:, 0].round(decimals=4).tolist()) == {0.0, 1.0}
