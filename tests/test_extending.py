@@ -214,7 +214,7 @@ FIELDS = {
     "centre: {term: model_field, field: body_ipos, names: [trunk], operation: add, range: [0.03, 0.03]}": ("body_ipos",),
     "limits: {term: model_field, field: actuator_forcerange, range: [0.2, 0.2]}": ("actuator_forcerange",),
     "mass: {scale: [0.6, 1.8], inertia: [0.5, 2.0]}": ("body_mass", "body_inertia"),
-    "com: {bodies: [trunk, left_thigh], offset: 0.05}": ("body_ipos",),
+    "com: {bodies: [trunk, left_thigh, right_foot], offset: 0.05}": ("body_ipos",),
     "each: {term: gains, kp: [0.7, 1.3], kv: [0.7, 1.3]}": ("actuator_gainprm", "actuator_biasprm"),
     "spin: {term: model_field, field: geom_friction, names: [floor], column: 1, range: [3.0, 3.0]}": ("geom_friction",),
     "friction: {range: [0.1, 0.1], when: once}": ("geom_friction",),

@@ -73,6 +73,7 @@ def test_an_imu_that_is_mounted_askew_tells_what_mujoco_s_would(make_env: MakeEn
     for world in range(4):
         quat = np.array([1.0, *(0.5 * angles[world].double().numpy())])
         model.site_quat[site] = quat / np.linalg.norm(quat)
+        mujoco.mj_setConst(model, data)
         data.qpos[:], data.qvel[:] = (x[world].double().numpy() for x in (env.sim.state.qpos, env.sim.state.qvel))
         mujoco.mj_forward(model, data)
         seen = {name: values[world].double().numpy() for name, values in obs["seen"].items()}
