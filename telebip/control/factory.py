@@ -21,7 +21,8 @@ def with_estimate(cfg: TaskConfig) -> TaskConfig:
     """
     policy = cfg.observations["policy"]
     noise = {params.get("term", name): params.get("noise", 0.0) for name, params in policy.terms.items()}
-    estimate = ObservationGroup({name: {"noise": noise.get(name, 0.0)} for name in ESTIMATE}, noise=policy.noise)
+    terms = {name: {"noise": noise.get(name, 0.0)} for name in ESTIMATE}
+    estimate = ObservationGroup(terms, noise=policy.noise, loss=policy.loss)
     return replace(cfg, observations={**cfg.observations, "estimate": estimate})
 
 

@@ -26,6 +26,7 @@ from telebip.eval.learning import learning_curve
 from telebip.eval.omni import OmniProtocol, omni_results
 from telebip.eval.push import PushProtocol, push_limits
 from telebip.eval.terrain import TerrainProtocol, on_test_ground, terrain_results
+from telebip.eval.transfer import TransferProtocol, transfer_results
 from telebip.eval.walk import heading_velocity, summarise
 from telebip.rl.run import machine_name, read_starts
 from telebip.robot import Robot
@@ -33,7 +34,7 @@ from telebip.rollout import Rollout, roll_out
 from telebip.sim import Backend, choose_backend
 
 SCHEMA = "telebip-results-2"
-SUITES = ("tracking", "push", "gait", "learning", "omni", "terrain")
+SUITES = ("tracking", "push", "gait", "learning", "omni", "terrain", "transfer")
 Progress = Callable[[str, int, int], None]  # called with what is running, the finished steps and their total
 
 
@@ -67,6 +68,7 @@ class Protocol:
     push: PushProtocol = field(default_factory=PushProtocol)
     omni: OmniProtocol = field(default_factory=OmniProtocol)
     terrain: TerrainProtocol = field(default_factory=TerrainProtocol)
+    transfer: TransferProtocol = field(default_factory=TransferProtocol)
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
     backend: Backend = "auto"
 
@@ -110,6 +112,8 @@ def evaluate(
         results["push"] = _push(candidate, robot, protocol, progress)
     if "terrain" in suites:
         results["terrain"] = _terrain(candidate, robot, protocol, progress)
+    if "transfer" in suites:
+        results["transfer"] = _transfer(candidate, robot, protocol, progress)
     if "omni" in suites:
         results["omni"] = _omni(candidate, robot, protocol, progress)
     if "learning" in suites:
@@ -156,10 +160,18 @@ def _terrain_protocol(candidate: Candidate, protocol: Protocol) -> TerrainProtoc
     return dataclasses.replace(protocol.terrain, command=command)
 
 
+def _transfer_protocol(candidate: Candidate, protocol: Protocol) -> TransferProtocol:
+    """Return how the transfer suite is run: at a speed that the policy was trained on."""
+    low, high = candidate.task.commands.lin_vel_x
+    command = protocol.transfer.command if candidate.is_model_based else float(np.clip(protocol.transfer.command, low, high))
+    return dataclasses.replace(protocol.transfer, command=command)
+
+
 def is_current(results: dict[str, Any], candidate: Candidate, suites: Sequence[str], protocol: Protocol) -> bool:
     """Whether results from a file are what `evaluate` would measure again: all of the suites, of the same, in the same way."""
     push = _push_protocol(candidate, protocol)
     pushed, omni, terrain = _as_json(push), _as_json(protocol.omni), _as_json(_terrain_protocol(candidate, protocol))
+    transfer = _as_json(_transfer_protocol(candidate, protocol))
     return (
         set(suites) <= results.keys()
         and all(results[suite] for suite in suites if suite != "learning")  # which may be null
@@ -168,10 +180,11 @@ def is_current(results: dict[str, Any], candidate: Candidate, suites: Sequence[s
         and ("push" not in suites or results["push"].get("protocol") == pushed)
         and ("omni" not in suites or results["omni"].get("protocol") == omni)
         and ("terrain" not in suites or results["terrain"].get("protocol") == terrain)
+        and ("transfer" not in suites or results["transfer"].get("protocol") == transfer)
     )
 
 
-def _as_json(protocol: PushProtocol | OmniProtocol | TerrainProtocol) -> dict[str, Any]:
+def _as_json(protocol: PushProtocol | OmniProtocol | TerrainProtocol | TransferProtocol) -> dict[str, Any]:
     """Return a protocol as it comes back from a file of results: tuples are lists there."""
     return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(protocol).items()}
 
@@ -242,6 +255,19 @@ def _terrain(candidate: Candidate, robot: Robot, protocol: Protocol, progress: P
     name, total = f"crossing terrain in {env.num_envs} worlds", math.ceil(terrain.seconds / env.step_dt)
     results = terrain_results(env, candidate.make_policy(env), terrain, lambda step: progress(name, step, total))
     return {"protocol": _as_json(terrain), **results}
+
+
+def _transfer(candidate: Candidate, robot: Robot, protocol: Protocol, progress: Progress) -> dict[str, Any]:
+    transfer = _transfer_protocol(candidate, protocol)
+    config = as_evaluated(on_flat_ground(candidate.config), transfer.worlds, transfer.duration, candidate.overrides)
+
+    def make(task: TaskConfig) -> tuple[TelebipEnv, Policy]:
+        task = with_estimate(task) if candidate.is_model_based else task
+        env = TelebipEnv(task, robot, protocol.device, protocol.backend)
+        return env, candidate.make_policy(env)
+
+    results = transfer_results(make, config, load_task(transfer.task), robot, transfer, progress)
+    return {"protocol": _as_json(transfer), **results}
 
 
 def _omni(candidate: Candidate, robot: Robot, protocol: Protocol, progress: Progress) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from telebip.robot import FLOOR
 from telebip.sim.base import shifted
 
 Range = Annotated[tuple[float, float], Quantity()]
-Scale = Annotated[tuple[float, float], Quantity(gt=0)]
+Scale = Annotated[tuple[float, float], Quantity(gt=0, nominal=1.0)]
 Ranges = dict[str, list[tuple[float, float]]]
 Random = dict[str, Tensor]
 
@@ -91,7 +91,7 @@ def push(
     memory: Memory,
     random: Random,
     *,
-    force: Annotated[float, Quantity("N", ge=0)],
+    force: Annotated[float, Quantity("N", ge=0, nominal=0.0)],
     duration: Annotated[float, Quantity("s", gt=0)],
     interval: Annotated[tuple[float, float], Quantity("s", gt=0)],
     ramp: Ramp,
@@ -175,7 +175,9 @@ def _com_random(world: World, *, offset: float, bodies: list[str]) -> Ranges:
 
 
 @event("reset", "once", random=_com_random, fields=lambda **_: ("body_ipos",))
-def com(step: Step, mask: Tensor, random: Random, *, offset: Annotated[float, Quantity("m", ge=0)], bodies: list[str]) -> None:
+def com(
+    step: Step, mask: Tensor, random: Random, *, offset: Annotated[float, Quantity("m", ge=0, nominal=0.0)], bodies: list[str]
+) -> None:
     """Move the centre of mass of each of these bodies, uniform within +- `offset` on each axis of its frame."""
     rows = rows_of(step.world, "body_ipos", bodies)
     moved = random["offset"].unflatten(1, (-1, 3)) + nominal(step.world, "body_ipos", rows)
@@ -252,8 +254,8 @@ def kick(
     mask: Tensor,
     random: Random,
     *,
-    lin_vel: Annotated[float, Quantity("m/s", ge=0)],
-    ang_vel: Annotated[float, Quantity("rad/s", ge=0)],
+    lin_vel: Annotated[float, Quantity("m/s", ge=0, nominal=0.0)],
+    ang_vel: Annotated[float, Quantity("rad/s", ge=0, nominal=0.0)],
 ) -> None:
     """Change the trunk's velocity at once, about all six axes, uniform within these bounds."""
     live = step.world.sim.memory["qvel"]
@@ -278,8 +280,8 @@ def encoder_bias(
     memory: Memory,
     random: Random,
     *,
-    hinge: Annotated[float, Quantity("rad", ge=0)],
-    slide: Annotated[float, Quantity("m", ge=0)],
+    hinge: Annotated[float, Quantity("rad", ge=0, nominal=0.0)],
+    slide: Annotated[float, Quantity("m", ge=0, nominal=0.0)],
 ) -> None:
     """Let every encoder be off by a constant, uniform within +- `hinge` or +- `slide` by the kind of its joint.
 
@@ -296,7 +298,12 @@ def encoder_bias(
     memory_name="imu_orientation",
 )
 def imu_orientation(
-    step: Step, mask: Tensor, memory: Memory, random: Random, *, angle: Annotated[float, Quantity("rad", ge=0, le=1)]
+    step: Step,
+    mask: Tensor,
+    memory: Memory,
+    random: Random,
+    *,
+    angle: Annotated[float, Quantity("rad", ge=0, le=1, nominal=0.0)],
 ) -> None:
     """Mount the inertial measurement unit askew, by up to +- `angle` about each axis of the trunk; see `Measured`."""
     _draw(memory["angles"], random["angles"], mask)
@@ -309,7 +316,7 @@ def imu_orientation(
     memory_name="gyro_bias",
 )
 def gyro_bias(
-    step: Step, mask: Tensor, memory: Memory, random: Random, *, rate: Annotated[float, Quantity("rad/s", ge=0)]
+    step: Step, mask: Tensor, memory: Memory, random: Random, *, rate: Annotated[float, Quantity("rad/s", ge=0, nominal=0.0)]
 ) -> None:
     """Let the gyro be off by a constant, uniform within +- `rate` on each axis: so does the heading drift, see `Measured`."""
     _draw(memory["bias"], random["bias"], mask)
@@ -327,7 +334,7 @@ def attitude_error(
     memory: Memory,
     random: Random,
     *,
-    tilt: Annotated[float, Quantity("rad", ge=0, le=1)],
+    tilt: Annotated[float, Quantity("rad", ge=0, le=1, nominal=0.0)],
     time: Annotated[float, Quantity("s", gt=0)],
 ) -> None:
     r"""Let roll and pitch that the attitude filter tells wander about the truth, as accelerations disturb its sense of gravity.

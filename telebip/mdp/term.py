@@ -41,6 +41,7 @@ class Quantity:
     ge: float | None = None
     lt: float | None = None
     le: float | None = None
+    nominal: float | None = None  # of what an event randomises: the value that changes nothing
 
 
 @dataclass(frozen=True)
