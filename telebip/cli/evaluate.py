@@ -19,6 +19,7 @@ EXAMPLES = """\
   evaluate.py --checkpoint assets/policies/telebip_flat --suite push --max-force 150
   evaluate.py --checkpoint assets/policies/telebip_efficient --suite omni
   evaluate.py --checkpoint assets/policies/telebip_stairs --suite tracking,terrain
+  evaluate.py --checkpoint assets/policies/telebip_efficient --suite transfer --transfer-points 0
   evaluate.py --controller dcm control.step_time=0.2 sim.decimation=1
   evaluate.py --controller alip --suite tracking --commands=-0.3,0.5        (with = before a negative number)
 """
@@ -39,6 +40,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         from telebip.eval.report import summary, write_report
         from telebip.eval.suites import Protocol, check_suites
         from telebip.eval.terrain import TerrainProtocol
+        from telebip.eval.transfer import TransferProtocol
     suites = check_suites(options.suite.split(","))
     check_overrides(options.overrides, suites)
     protocol = Protocol(
@@ -49,6 +51,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         push=PushProtocol(max_force=options.max_force, worlds=min(32, options.push_worlds), limit_worlds=options.push_worlds),
         omni=OmniProtocol(worlds=options.omni_worlds),
         terrain=TerrainProtocol(worlds=options.terrain_worlds),
+        transfer=TransferProtocol(
+            worlds=options.transfer_worlds, points=options.transfer_points, sweep_worlds=min(64, options.transfer_worlds)
+        ),
         device=resolve_device(options.device),
         backend=options.backend,
     )
@@ -183,14 +188,16 @@ def speeds(text: str) -> tuple[float, ...]:
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = Parser(
-        "Measure how something walks: tracking, energy, pushes, gait, learning, all directions, rough terrain.",
+        "Measure how something walks: tracking, energy, pushes, gait, learning, all directions, rough terrain, other robots.",
         EXAMPLES,
     )
     who = parser.add_mutually_exclusive_group()
     who.add_argument("--checkpoint", metavar="PATH_OR_RUN", help="a checkpoint file, or a run folder for its newest")
     who.add_argument("--controller", choices=CONTROLLERS, help="a model-based walker: angular momentum, or DCM")
     suites = "tracking,push,gait,learning"
-    parser.add_argument("--suite", default=suites, metavar="A,B", help=f"which suites; also omni, terrain (default: {suites})")
+    parser.add_argument(
+        "--suite", default=suites, metavar="A,B", help=f"which suites; also omni, terrain, transfer (default: {suites})"
+    )
     parser.add_argument("--out", metavar="DIR", help="folder of results.json and the report (default: reports/<label>)")
     parser.add_argument("--label", metavar="NAME", help="name in tables and plots (default: the task's)")
     parser.add_argument("--num-envs", type=int, default=64, metavar="N", help="worlds for each commanded speed (default: 64)")
@@ -206,6 +213,10 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--push-worlds", type=int, default=300, metavar="N", help="worlds at the largest pushes (default: 300)")
     parser.add_argument("--omni-worlds", type=int, default=16, metavar="N", help="worlds for each omni command (default: 16)")
     parser.add_argument("--terrain-worlds", type=int, default=64, metavar="N", help="worlds for each level (default: 64)")
+    parser.add_argument("--transfer-worlds", type=int, default=512, metavar="N", help="worlds drawn from ranges (default: 512)")
+    parser.add_argument(
+        "--transfer-points", type=int, default=7, metavar="N", help="values of each factor in sweeps, 0 for none (default: 7)"
+    )
     parser.add_engine()
     parser.add_allow_robot_change()
     parser.add_overrides()
@@ -216,6 +227,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         )
     bounds = {"num_envs": (1, 2**20), "duration": (1, 3600), "max_force": (5, 5000), "push_worlds": (1, 2**16)}
     bounds |= {"omni_worlds": (1, 2**12), "terrain_worlds": (1, 2**12)}
+    bounds |= {"transfer_worlds": (1, 2**16), "transfer_points": (0, 100)}
     for name, (low, high) in bounds.items():
         value = getattr(options, name)
         if not low <= value <= high:
@@ -224,7 +236,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         f"--{name.replace('_', '-')}={','.join(map(str, value)) if isinstance(value, tuple) else value}"
         for name in (
             *("suite", "num_envs", "duration", "commands", "max_force"),
-            *("push_worlds", "omni_worlds", "terrain_worlds", "backend"),
+            *("push_worlds", "omni_worlds", "terrain_worlds", "transfer_worlds", "transfer_points", "backend"),
         )
         if (value := getattr(options, name)) != parser.get_default(name)
     ] + ["--allow-robot-change"] * options.allow_robot_change

@@ -198,6 +198,36 @@ def terrain(results: Results) -> Figure:
     return figure
 
 
+@rc_context(STYLE)
+def transfer(results: Results) -> Figure:
+    """Share of the worlds without a fall, with its 95 % interval, and the speed error of the median one, factor by factor."""
+    factors, protocol = results["transfer"]["factors"], results["transfer"]["protocol"]
+    columns = 4
+    rows = -(-len(factors) // columns)
+    figure = Figure((9.6, 0.9 + 1.5 * rows), layout="constrained")
+    figure.suptitle(f"{named(results)}: one factor at a time at {protocol['command']:g} m/s (dotted: nominal)", fontsize=10)
+    grid = figure.subplots(rows, columns, sharey=True, squeeze=False)
+    for axes, factor in zip(grid.flat, factors, strict=False):
+        unit, points = factor["unit"], factor["points"]
+        scale = 1000.0 * results["transfer"]["physics_dt"] if unit == "physics steps" else 1.0
+        value = [scale * row["value"] for row in points]
+        shares = [[row[name] for row in points] for name in ("success_low", "success_high", "success")]
+        axes.fill_between(value, shares[0], shares[1], color=COLORS[1], alpha=0.15, lw=0)
+        axes.plot(value, shares[2], "o-", color=COLORS[1], lw=1.3, ms=3, label="share without a fall")
+        error = np.array([row["speed_error"] for row in points], dtype=float)
+        axes.plot(value, error, "s--", color=COLORS[0], lw=1.1, ms=2.5, label="speed error, median")
+        axes.axvline(scale * factor["nominal"], color="#8b9099", lw=0.9, ls=":")
+        shown = "ms" if unit == "physics steps" else unit
+        axes.set(ylim=(-0.04, 1.04))
+        axes.set_title(factor["name"].replace("_", " ") + (f" [{shown}]" if shown else ""), fontsize=8, fontweight="normal")
+        axes.tick_params(labelsize=7)
+    for axes in grid.flat[len(factors) :]:
+        axes.set_visible(False)
+    if factors:
+        figure.legend(*grid.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    return figure
+
+
 def obstacle(row: Mapping[str, Any]) -> str:
     """Return the size of a level's obstacles as people say it: "12 cm", "7.5°"."""
     return f"{np.degrees(row['size']):.3g}°" if row["unit"] == "rad" else f"{100.0 * row['size']:.3g} cm"

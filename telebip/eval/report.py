@@ -136,8 +136,10 @@ def _comparisons(all_results: Sequence[Results], references: Sequence[Results]) 
             yield f"push_{horizon}", plots.push(together, horizon)
     if any(results.get("learning") for results in all_results):
         yield "learning", plots.learning(all_results)
-    for suite, draw in (("omni", plots.omni), ("terrain", plots.terrain)):
+    for suite, draw in (("omni", plots.omni), ("terrain", plots.terrain), ("transfer", plots.transfer)):
         measured = [results for results in all_results if results.get(suite)]
+        if suite == "transfer":
+            measured = [results for results in measured if results[suite]["factors"]]
         for i, results in enumerate(measured, 1):
             yield f"{suite}_{i}" if len(measured) > 1 else suite, draw(results)
 
@@ -164,6 +166,14 @@ def _tables(all_results: Sequence[Results]) -> list[Table]:
     learning = ["walker", "samples", "to 95 % of the final episode length", "to 95 % of the final return"]
     omni = ["walker", "largest error [m/s]", "[rad/s]", "falls", "falls after changes", "COT straight ahead"]
     omni += ["forward [m/s]", "backward [m/s]", "sideways [m/s]", "turning [rad/s]"]
+    transfer = [
+        "width of the ranges",
+        "without a fall",
+        "95 % interval",
+        "speed error, median",
+        "95 % of worlds",
+        "COT, median",
+    ]
     rough = of("terrain")
     kinds = [name.replace("_", " ") for name in rough[0][1]["limits"]] if rough else []
     horizons = sorted({h for _, limits in of("push") for h in limits if h.endswith("s") and h[0].isdigit()}, key=_seconds)
@@ -182,6 +192,11 @@ def _tables(all_results: Sequence[Results]) -> list[Table]:
             "Hardest terrain passed",
             ["walker", *kinds],
             [[label, *_terrain_cells(part)] for label, part in rough],
+        ),
+        (
+            "Transfer: worlds of drawn robots",
+            ["walker", *transfer],
+            [[label, *_transfer_cells(row)] for label, part in of("transfer") for row in part["worlds"]],
         ),
         ("Gait", gait, [[label, *(number(value, 3) for value in row.values())] for label, row in of("gait")]),
         ("Learning", learning, [[label, *_learning_cells(curve)] for label, curve in of("learning")]),
@@ -232,6 +247,20 @@ def _omni_cells(part: dict[str, Any]) -> list[str]:
 def _terrain_cells(part: dict[str, Any]) -> list[str]:
     units = {row["type"]: row["unit"] for row in part["levels"]}
     return [plots.obstacle({"size": size, "unit": units[name]}) if size else "-" for name, size in part["limits"].items()]
+
+
+def _transfer_cells(row: dict[str, Any]) -> list[str]:
+    def percent(value: float | None) -> str:
+        return number(100.0 * value, 1) + " %" if value is not None and math.isfinite(value) else "-"
+
+    return [
+        number(row["width"], 2),
+        f"{row['worlds'] - row['falls']} of {row['worlds']}",
+        f"{percent(row['success_low'])} to {percent(row['success_high'])}",
+        percent(row["speed_error"]),
+        percent(row["speed_error_quantiles"]["0.95"]),
+        number(row["cot"], 3),
+    ]
 
 
 def _learning_cells(curve: dict[str, Any]) -> list[str]:

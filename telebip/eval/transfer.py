@@ -12,7 +12,7 @@ from torch import Tensor
 from telebip.config import TaskConfig
 from telebip.control.policy import Policy
 from telebip.env import TelebipEnv
-from telebip.eval.terrain import wilson
+from telebip.eval.statistics import share_interval
 from telebip.mdp.term import Params, find
 from telebip.robot import FLOOR, Robot
 from telebip.rollout import judge_faults, walk
@@ -171,7 +171,7 @@ def in_worlds(config: TaskConfig, ranges: TaskConfig) -> TaskConfig:
     late = {name: getattr(ranges.actions, name) for name in ("delay", "physics_delay", "jitter", "loss")}
     return replace(
         config,
-        events={**config.events, **ranges.events},
+        events={**config.events, **dict(_disturbances(ranges))},
         actions=replace(config.actions, **late),
         observations={**config.observations, "policy": seen},
     )
@@ -245,6 +245,8 @@ def walk_worlds(
             distance += env.step_dt * view.heading_lin_vel[:, 0]
             energy += env.step_dt * view.state.joint_power.sum(1)
         progress(step)
+        if not walks.any():
+            break
     judge_faults(env)
     speed = distance / (env.step_dt * max(1, steps - skipped))
     return _row(walks, {"speed": speed, "cot": energy / (_weight(env) * distance)}, protocol.command)
@@ -263,7 +265,7 @@ def _row(walks: Tensor, measured: Mapping[str, Tensor], command: float) -> dict[
     upright = walks.cpu().numpy()
     speed, cot = (measured[name].cpu().numpy()[upright] for name in ("speed", "cot"))
     number, worlds = len(speed), len(upright)
-    low, high = wilson(number, worlds)
+    low, high = share_interval(number, worlds)
     error = np.abs(speed - command) / abs(command)
     quantiles = np.quantile(error, QUANTILES) if number else np.full(len(QUANTILES), math.nan)
     row = {
