@@ -27,6 +27,8 @@ from telebip.errors import UserError
 from telebip.mdp.term import TERMS, Quantity, reward
 
 FLAT = load_task("telebip_flat")
+EXACT = {"noise": 0.0, "delay": (0, 0)}
+"""What an observation is if nothing is said of it."""
 CHILDREN = (
     *("telebip_backward", "telebip_efficient", "telebip_fast", "telebip_omni", "telebip_quick", "telebip_robust"),
     *("telebip_rough", "telebip_slow", "telebip_stairs"),
@@ -381,13 +383,13 @@ def test_an_entry_of_another_function_does_not_keep_the_parameters(tmp_path: Pat
 def test_a_file_states_a_group_of_observations_as_a_whole(tmp_path: Path) -> None:
     text = "observations:\n  policy: {phase: {}, joint_pos: {noise: 0.1}, history: 3}\n"
     task = load_task(task_file(tmp_path, text))
-    assert task.observations == {"policy": ObservationGroup({"phase": {"noise": 0.0}, "joint_pos": {"noise": 0.1}}, history=3)}
+    assert task.observations == {"policy": ObservationGroup({"phase": EXACT, "joint_pos": {**EXACT, "noise": 0.1}}, history=3)}
     assert [*task.observations["policy"].terms] == ["phase", "joint_pos"]
 
 
 def test_a_group_more_leaves_the_others_as_they_are(tmp_path: Path) -> None:
     task = load_task(task_file(tmp_path, "observations:\n  critic: {friction: {}, noise: false, delay: [0, 2]}\n"))
-    critic = ObservationGroup({"friction": {"noise": 0.0}}, delay=(0, 2), noise=False)
+    critic = ObservationGroup({"friction": EXACT}, delay=(0, 2), noise=False)
     assert task.observations == {**FLAT.observations, "critic": critic}
     (tmp_path / "child.yaml").write_text("base: task.yaml\nobservations: {critic: null}\n")
     assert load_task(str(tmp_path / "child.yaml")) == load_task(task, ["observations.critic=null"]) == FLAT
@@ -397,9 +399,9 @@ def test_overrides_change_single_fields_of_a_group() -> None:
     overrides = ["joint_pos.noise=0.01", "history=5", "base_lin_vel=null", "base_height={}"]
     policy = load_task(FLAT, [f"observations.policy.{override}" for override in overrides]).observations["policy"]
     assert [*policy.terms] == [*(n for n in FLAT.observations["policy"].terms if n != "base_lin_vel"), "base_height"]
-    assert (policy.terms["joint_pos"], policy.history) == ({"noise": 0.01}, 5)
+    assert (policy.terms["joint_pos"], policy.history) == ({**EXACT, "noise": 0.01}, 5)
     whole = load_task(FLAT, ["observations.policy={phase: {}}"]).observations["policy"]
-    assert whole == ObservationGroup({"phase": {"noise": 0.0}})
+    assert whole == ObservationGroup({"phase": EXACT})
 
 
 def test_names_merge_one_by_one_and_null_removes_one(tmp_path: Path) -> None:
@@ -492,7 +494,7 @@ def test_a_task_made_in_code_is_checked_and_completed() -> None:
     )
     task = check(made)
     assert task.rewards == {"energy": {"k_energy": -1.0, "ramp": (0.0, 5.0)}}
-    assert task.observations["critic"].terms == {"friction": {"noise": 0.0}, "height": {"term": "base_height", "noise": 0.0}}
+    assert task.observations["critic"].terms == {"friction": EXACT, "height": {"term": "base_height", **EXACT}}
     assert check(task) == task == load_task(task)
     assert energy == {"k_energy": -1, "ramp": [0, 5]}  # what was given is as it was
     assert check(FLAT) == FLAT
@@ -593,7 +595,7 @@ def test_terms_unknown_here_are_left_out_of_a_checkpoints_task_and_named() -> No
         *("events.storm", "observations.critic.smell", "observations.nose.smell"),
         *("rewards.lost", "rewards.soft", "terminations.over"),
     ]
-    critic = ObservationGroup({"phase": {"noise": 0.0}})
+    critic = ObservationGroup({"phase": EXACT})
     assert task == dataclasses.replace(FLAT, observations={**FLAT.observations, "critic": critic})
 
 
@@ -784,7 +786,7 @@ GROUPS = st.builds(
     ObservationGroup,
     st.dictionaries(
         st.sampled_from(["phase", "joint_pos", "base_quat", "friction"]),
-        st.builds(lambda noise: {"noise": noise}, finite(0, 1e30)),
+        st.builds(lambda noise: {**EXACT, "noise": noise}, finite(0, 1e30)),
         min_size=1,
     ),
     st.integers(1, 1000),

@@ -30,19 +30,21 @@ class Part:
     axes: tuple[str, ...]  # names of its numbers
     image: Image | str  # how it is mirrored, or why it cannot be
     noise: float  # amplitude, in its unit
+    delay: tuple[int, int]  # least and most [policy steps], on top of the group's
 
 
 class Group:
     """One vector of observations of every world.
 
-    With a `history` of N it is the latest N frames, the newest first, and with a `delay` they are that many policy steps old;
-    where an episode is younger than that, its first frame stands for those before. With a `loss`, that share of the frames
+    With a `history` of N it is the latest N frames, the newest first, and with a `delay` they are that many policy steps old,
+    those of a term with a `delay` of its own by that much more; where an episode is younger than that, its first frame stands
+    for those before. With a `loss`, that share of the frames
     keeps what the sensors told in the frame before. Without `noise`, the truth is seen: no noise, and no errors of the sensors.
     """
 
     def __init__(self, name: str, cfg: ObservationGroup, binder: Binder) -> None:
         """Bind the terms, and find their sizes by observing once."""
-        self.name, self.history, self._delay = name, cfg.history, cfg.delay
+        self.name, self.history = name, cfg.history
         section, world = f"observations.{name}", binder.step.world
         self._terms = [binder.bind("observation", section, entry, params) for entry, params in cfg.terms.items()]
         self.parts = [
@@ -57,11 +59,15 @@ class Group:
         is_sensed = [find_term("observation", *item).is_sensed for item in cfg.terms.items()]
         sensed = [yes for yes, part in zip(is_sensed, self.parts, strict=True) for _ in range(part.size)]
         self._is_sensed = torch.tensor(sensed, device=world.device)
-        late = [(cfg.delay[0], cfg.delay[1] + 1)] if cfg.delay[1] else []
+        delays = [cfg.delay, *(part.delay for part in self.parts)]
+        longest = cfg.delay[1] + max(part.delay[1] for part in self.parts)
+        late = [(float(low), float(high + 1)) for low, high in delays] if longest else []  # of numbers whose floor counts
+        sizes = torch.tensor([part.size for part in self.parts], device=world.device)
+        self._is_late, self._part = longest > 0, torch.arange(len(sizes), device=world.device).repeat_interleave(sizes)
         lost = [(0.0, 1.0)] if cfg.loss else []
         self._random = binder.random(section, {"noise": noise if self._has_noise else [], "delay": late, "loss": lost})
-        kept = cfg.history + cfg.delay[1]
-        frames = {"frames": world.zeros(kept * self.frame_size), "age": world.zeros()}
+        kept = cfg.history + longest
+        frames = {"frames": world.zeros(kept * self.frame_size), "age": world.zeros(len(self.parts))}
         self._memory = binder.memory(section, frames) if kept > 1 or cfg.loss else None
 
     def layout(self) -> list[dict[str, Any]]:
@@ -89,13 +95,12 @@ class Group:
             frame = torch.where(is_lost, frames[:, :size], frame)
         frames[:, :size] = frame
         frames.copy_(torch.where(step.is_new[:, None], frame.repeat(1, kept), frames))
-        if not self._delay[1]:
+        if not self._is_late:
             return frames.contiguous()
-        age = self._memory["age"]
-        torch.where(step.is_new, self._random["delay"][:, 0].floor(), age, out=age)
-        index = age.long()[:, None] + torch.arange(self.history, device=frame.device)
-        seen = frames.unflatten(1, (kept, size)).gather(1, index[:, :, None].expand(-1, -1, size))
-        return seen.flatten(1).contiguous()
+        age, late = self._memory["age"], self._random["delay"].floor()
+        torch.where(step.is_new[:, None], late[:, :1] + late[:, 1:], age, out=age)
+        index = age.long()[:, None, self._part] + torch.arange(self.history, device=frame.device)[:, None]
+        return frames.unflatten(1, (kept, size)).gather(1, index).flatten(1).contiguous()
 
 
 def _part(where: str, entry: str, params: Params, has_noise: bool, bound: Bound, step: Step) -> Part:
@@ -108,5 +113,5 @@ def _part(where: str, entry: str, params: Params, has_noise: bool, bound: Bound,
     mirror = term.mirror(**own(term, params)) if callable(term.mirror) else term.mirror
     names = robot.joint_names if mirror == "joints" else AXES.get(mirror, ()) if isinstance(mirror, str) else ()
     axes = names if len(names) == size else tuple(map(str, range(size)))
-    noise = params["noise"] if has_noise else 0.0
-    return Part(entry, size, term.unit, axes, image_of(mirror, size, robot), noise)
+    noise = params.get("noise", 0.0) if has_noise else 0.0
+    return Part(entry, size, term.unit, axes, image_of(mirror, size, robot), noise, params.get("delay", (0, 0)))

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from telebip.errors import UserError, nearest
 from telebip.mdp.fields import rows_of
-from telebip.mdp.step import Step
+from telebip.mdp.step import Step, World
 from telebip.mdp.term import Image, Quantity, observation
 from telebip.robot import FLOOR
 
@@ -99,7 +99,7 @@ def base_height(step: Step) -> Tensor:
     return step.base_height[:, None]
 
 
-def _scan_size(*, forward: tuple[float, float], aside: float, spacing: float) -> tuple[int, int]:
+def _scan_size(*, forward: tuple[float, float], aside: float, spacing: float, **_) -> tuple[int, int]:
     """Return how many points a scan has along the heading, and how many across it."""
     return round((forward[1] - forward[0]) / spacing) + 1, 2 * round(aside / spacing) + 1
 
@@ -110,30 +110,42 @@ def _scan_image(**parameters) -> Image:
     return [row * across + i for row in range(rows) for i in reversed(range(across))], [1.0] * (rows * across)
 
 
+def _scan_random(world: World, *, missing: float = 0.0, **parameters) -> dict[str, list[tuple[float, float]]]:
+    rows, across = _scan_size(**parameters)
+    return {"missing": [(0.0, 1.0)] * (rows * across) if missing else []}
+
+
 @observation(
-    unit="m, ground relative to the trunk's frame, point by point from back to front, from right to left", mirror=_scan_image
+    unit="m, ground relative to the trunk's frame, point by point from back to front, from right to left",
+    mirror=_scan_image,
+    random=_scan_random,
 )
 def height_scan(
     step: Step,
+    random: dict[str, Tensor],
     *,
     forward: Annotated[tuple[float, float], Quantity("m", ge=-5, le=5)],
     aside: Annotated[float, Quantity("m", ge=0, le=5)],
     spacing: Annotated[float, Quantity("m", ge=0.01, le=5)],
+    missing: Annotated[float, Quantity(ge=0, le=1)] = 0.0,
 ) -> Tensor:
     """Heights of the ground around the robot, relative to the trunk's frame [m], (num_envs, points).
 
     Args:
         step: the present step.
+        random: which points are missing.
         forward: from where to where along the robot's heading [m].
         aside: how far to each side of it [m].
         spacing: between neighbouring points [m].
+        missing: share of the points that are not seen, anew in every step; they are as high as the ground below the robot [-].
     """
     rows, across = _scan_size(forward=forward, aside=aside, spacing=spacing)
     point = torch.arange(rows * across, device=step.world.device)
     ahead, left = forward[0] + spacing * (point // across), spacing * (point % across - across // 2)
     x, y, z = step.state.base_pos[:, :, None].unbind(1)  # (num_envs, 1) each
     c, s = torch.cos(step.heading)[:, None], torch.sin(step.heading)[:, None]
-    return step.ground_height(x + c * ahead - s * left, y + s * ahead + c * left) - z
+    seen = step.ground_height(x + c * ahead - s * left, y + s * ahead + c * left) - z
+    return torch.where(random["missing"] < missing, -step.base_height[:, None], seen) if missing else seen
 
 
 @observation(unit="as the MJCF's sensor", mirror=lambda *, sensor, mirror: mirror, sensors=lambda *, sensor, mirror: (sensor,))

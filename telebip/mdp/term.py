@@ -110,7 +110,10 @@ class Term:
 
 
 _COMMON: dict[Kind, dict[str, Parameter]] = {
-    "observation": {"noise": Parameter(float, Quantity(ge=0), 0.0)},  # amplitude of the uniform noise, in the term's unit
+    "observation": {
+        "noise": Parameter(float, Quantity(ge=0), 0.0),  # amplitude of the uniform noise, in the term's unit
+        "delay": Parameter(tuple[int, int], Quantity("policy steps", ge=0, le=100), (0, 0)),  # on top of the group's
+    },
     "reward": {},
     "termination": {},
     "event": {},

@@ -62,6 +62,13 @@ def test_a_late_history_is_late_as_a_whole(robot: Robot) -> None:
     assert frames.tolist() == [[0, 0], [0, 0], [1, 0], [2, 1], [3, 2], [4, 3], [5, 4]]
 
 
+def test_a_term_may_be_later_than_its_group(robot: Robot) -> None:
+    terms = {**CLOCK, "command": {"noise": 0.0, "delay": (2, 2)}}
+    frames = seen(make_step(robot, 2), ObservationGroup(terms, history=2, delay=(1, 1)), AGES)[:, 0]
+    assert frames[:, :, 0].tolist() == [[0, 0], [0, 0], [1, 0], [2, 1], [3, 2], [4, 3], [5, 4]]
+    assert frames[:, :, 2].tolist() == [[0, 0], [0, 0], [0, 0], [0, 0], [1, 0], [2, 1], [3, 2]]
+
+
 def test_delays_are_drawn_once_per_world_and_episode(robot: Robot) -> None:
     ages = [torch.full((512,), t % 6) for t in range(12)]
     frames = seen(make_step(robot, 512), ObservationGroup(CLOCK, delay=(1, 3)), ages)[:, :, 0, 0]

@@ -251,7 +251,7 @@ def test_every_observation_says_its_unit_and_how_it_is_mirrored() -> None:
             assert term.mirror != "none", name
 
 
-SCAN = {"forward": (-0.2, 0.4), "aside": 0.1, "spacing": 0.1}
+SCAN = {"forward": (-0.2, 0.4), "aside": 0.1, "spacing": 0.1, "missing": 0.0}
 
 BELOW = 0.1 * (1.0 - 0.5) - 0.1 * (2.975 - 0.5)  # half a metre from the platform; at the tile's edge the ground is at 0
 
@@ -268,7 +268,7 @@ def on_a_slope(robot: Robot) -> Step:
 
 def test_a_height_scan_turns_with_the_heading(robot: Robot) -> None:
     step = on_a_slope(robot)
-    scan = observations.height_scan(step, **SCAN)
+    scan = observations.height_scan(step, {}, **SCAN)
     assert scan.shape == (2, 7 * 3)
     below = BELOW - 0.7
     ahead, aside = torch.linspace(-0.2, 0.4, 7)[:, None], torch.linspace(-0.1, 0.1, 3)
@@ -280,7 +280,17 @@ def test_a_height_scan_turns_with_the_heading(robot: Robot) -> None:
 
 def test_a_height_scan_of_flat_ground_is_the_height_of_the_trunk(robot: Robot) -> None:
     step = make_step(robot, num_envs=2)
-    torch.testing.assert_close(observations.height_scan(step, **SCAN), torch.full((2, 21), -0.66))
+    torch.testing.assert_close(observations.height_scan(step, {}, **SCAN), torch.full((2, 21), -0.66))
+
+
+def test_missing_points_of_a_height_scan_are_as_high_as_the_ground_below(robot: Robot) -> None:
+    step = on_a_slope(robot)
+    drawn = {"missing": torch.full((2, 21), 0.5)}
+    drawn["missing"][:, 4] = 0.1
+    seen, whole = observations.height_scan(step, drawn, **{**SCAN, "missing": 0.2}), observations.height_scan(step, {}, **SCAN)
+    torch.testing.assert_close(seen[:, 4], -observations.base_height(step)[:, 0])
+    rest = [i for i in range(21) if i != 4]  # point 4 is 0.1 m behind
+    assert torch.equal(seen[:, rest], whole[:, rest]) and (whole[0, 4] - seen[0, 4]).abs() > 0.005
 
 
 def test_the_mirror_image_of_a_height_scan_swaps_right_and_left(robot: Robot) -> None:
