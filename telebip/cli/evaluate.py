@@ -65,7 +65,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     out = Path(options.out) if options.out else default_folder(candidate.label)
     results = measure(console, candidate, suites, protocol, out)
     title, text = f"{candidate.label}: how it walks", f"Measured by: {candidate.source}"
-    write_report([results], out, title, text, references=references())
+    write_report([[results]], out, title, text, references=references())
     console.print(summary(results, console.width))
     console.print(f"wrote report.md, report.html and results.json to\n{out}")
 

@@ -10,7 +10,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.projections.polar import PolarAxes
 
+from telebip.eval.statistics import estimate
+
 Results = dict[str, Any]
+Group = Sequence[Results]  # of a walker's seeds
 
 COLORS = ("#e8731f", "#29598f", "#3f8f5f", "#8a5aa8", "#c2455a", "#7a6a3a", "#2f9fa8", "#555b66", "#d9b02c", "#7fb3e0")
 GREYS = ("#9aa0a8", "#b6bac0", "#ced1d6")
@@ -85,43 +88,55 @@ def feet(results: Results) -> Figure:
 
 
 @rc_context(STYLE)
-def cost_of_transport(all_results: Sequence[Results], commands: Sequence[float] = (0.5, 0.7, 1.0)) -> Figure:
+def cost_of_transport(groups: Sequence[Group], commands: Sequence[float] = (0.5, 0.7, 1.0)) -> Figure:
     """Cost of transport by method and commanded speed, where most worlds walk on; by the formula that the article reports."""
-    costs = []
-    for results in all_results:
-        walks_on = [row for row in results.get("tracking", ()) if row.get("falls", 0) <= row.get("worlds", 0) / 2]
-        cost = {row["command_mps"]: row["cot_article"] for row in walks_on}
-        costs.append({at: cost[command] for at, command in enumerate(commands) if command in cost})
+    costs: list[dict[int, list[float]]] = []
+    for group in groups:
+        cost: dict[int, list[float]] = {}
+        for row in (row for results in group for row in results.get("tracking", ())):
+            walks_on = row.get("falls", 0) <= row.get("worlds", 0) / 2 and row["cot_article"] is not None
+            if walks_on and row["command_mps"] in commands:
+                cost.setdefault(commands.index(row["command_mps"]), []).append(row["cot_article"])
+        costs.append(cost)
     figure = Figure((7.2 + 0.6 * max(0, sum(map(bool, costs)) - 6), 3.0))
     axes = figure.subplots()
-    _bars(axes, all_results, costs, [f"{command:.1f} m/s" for command in commands], "%.2f")
+    _bars(axes, groups, costs, [f"{command:.1f} m/s" for command in commands], "%.2f")
     axes.set(ylabel="cost of transport [-]", title="Cost of transport (lower is better)")
     return figure
 
 
 @rc_context(STYLE)
-def push(all_results: Sequence[Results], horizon: str = "10s") -> Figure:
-    """Largest push survived, by method and direction."""
-    figure = Figure((7.2, 3.0))
-    axes, limits = figure.subplots(), [(results.get("push") or {}).get(horizon) for results in all_results]
-    directions = list(enumerate(("forward", "backward", "lateral")))
-    forces = [{at: limit[f"{name}_n"] for at, name in directions} if limit else {} for limit in limits]
-    _bars(axes, all_results, forces, ["forward", "backward", "lateral (worse side)"], "%.0f")
+def push(groups: Sequence[Group], horizon: str = "10s") -> Figure:
+    """Largest push that all worlds survive, by method and direction; the article reports no other."""
+    figure = Figure((7.2 + 0.6 * max(0, len(groups) - 8), 3.0))
+    axes, directions = figure.subplots(), ("forward", "backward", "lateral")
+    limits = [[limit for results in group if (limit := (results.get("push") or {}).get(horizon))] for group in groups]
+    forces = [{at: [limit[f"{name}_n"] for limit in of_it] for at, name in enumerate(directions) if of_it} for of_it in limits]
+    _bars(axes, groups, forces, ["forward", "backward", "lateral (worse side)"], "%.0f")
     axes.set(ylabel="force for 0.1 s [N]", title=f"Largest push survived during {horizon.removesuffix('s')} s of walking")
     return figure
 
 
 def _bars(
-    axes: Axes, all_results: Sequence[Results], heights: Sequence[Mapping[int, float]], ticks: list[str], digits: str
+    axes: Axes, groups: Sequence[Group], heights: Sequence[Mapping[int, Sequence[float]]], ticks: list[str], digits: str
 ) -> None:
-    """Draw a group of bars at every tick, one for each method that has any of `heights`, which are by the tick's index."""
+    """Draw a group of bars at every tick: a method's interquartile mean with its interval, and a dot for each seed.
+
+    `heights` holds each method's values by the tick's index; a method without any has no bars.
+    """
     shown = [k for k, height in enumerate(heights) if height]
     width = 0.84 / max(1, len(shown))
     for i, k in enumerate(shown):
         x = [at + (i - 0.5 * (len(shown) - 1)) * width for at in heights[k]]
-        tone = color(k, all_results[k]["label"])
-        bars = axes.bar(x, list(heights[k].values()), 0.92 * width, color=tone, label=named(all_results[k]))
+        found = [estimate(values) for values in heights[k].values()]
+        tone = color(k, groups[k][0]["label"])
+        bars = axes.bar(x, [one.value for one in found], 0.92 * width, color=tone, label=named(groups[k][0]))
         axes.bar_label(bars, fmt=digits, fontsize=7, padding=1)
+        for at, one, values in zip(x, found, heights[k].values(), strict=True):
+            if len(values) > 1:
+                axes.plot([at] * len(values), values, "o", color="black", ms=2.0, alpha=0.6)
+            if np.isfinite(one.low):
+                axes.plot([at, at], [one.low, one.high], color="black", lw=1.2)
     axes.set_xticks(range(len(ticks)), ticks)
     axes.grid(axis="x", visible=False)
     if shown:
@@ -256,16 +271,66 @@ def joints(results: Results) -> Figure:
 
 
 @rc_context(STYLE)
-def learning(all_results: Sequence[Results]) -> Figure:
-    """Episode length and velocity error against samples."""
+def energy(all_results: Sequence[Results]) -> Figure:
+    """Where the energy goes at the speed nearest to 0.7 m/s, by walker: joints and phases, driving right, braking left."""
+    nearest = [
+        (named(results), min(rows, key=lambda row: abs(row["command_mps"] - 0.7)))
+        for results in all_results
+        if (rows := results.get("tracking"))
+    ]
+    figure = _energy_bars(
+        [f"{label}, {row['command_mps']:g} m/s" for label, row in nearest], [row["energy"] for _, row in nearest]
+    )
+    figure.axes[0].set_title("Where the energy goes (right: drives, left: brakes)")
+    return figure
+
+
+@rc_context(STYLE)
+def energy_by_speed(results: Results) -> Figure:
+    """Where the energy of one walker goes, by speed."""
+    rows = results["tracking"]
+    figure = _energy_bars([f"{row['command_mps']:g} m/s" for row in rows], [row["energy"] for row in rows])
+    figure.axes[0].set_title(f"{named(results)}: where the energy goes (right: drives, left: brakes)")
+    return figure
+
+
+def _energy_bars(labels: Sequence[str], rows: Sequence[Sequence[dict[str, Any]]]) -> Figure:
+    """Draw a bar for each of `rows`: joints by colour, phases by shade, positive work to the right and negative to the left."""
+    figure = Figure((8.6, 1.4 + 0.34 * len(rows)))
+    axes, shades = figure.subplots(), {"stance": 1.0, "double_support": 0.65, "swing": 0.35}
+    parts = list(dict.fromkeys((part["joint"], part["phase"]) for row in rows for part in row))
+    joints = list(dict.fromkeys(joint for joint, _ in parts))
+    for sign, way in (("positive", 1.0), ("negative", -1.0)):
+        left = np.zeros(len(rows))
+        for joint, phase in parts:
+            found = [{(part["joint"], part["phase"]): part[sign] or 0.0 for part in row} for row in rows]
+            width = way * np.array([part.get((joint, phase), 0.0) for part in found])
+            label = f"{joint}, {phase}".replace("_", " ") if sign == "positive" else None
+            tone = COLORS[joints.index(joint) % len(COLORS)]
+            axes.barh(range(len(rows)), width, left=left, color=tone, alpha=shades[phase], label=label)
+            left += width
+    axes.axvline(0.0, color="#22262c", lw=0.8)
+    axes.set_yticks(range(len(rows)), list(labels))
+    axes.invert_yaxis()
+    axes.grid(axis="y", visible=False)
+    axes.set(xlabel="share of the cost of transport [-]")
+    axes.legend(**BESIDE, fontsize=7)
+    return figure
+
+
+@rc_context(STYLE)
+def learning(groups: Sequence[Group]) -> Figure:
+    """Episode length and velocity error against samples; a line for each seed."""
     figure = Figure((9.2, 2.8))
     left, right = figure.subplots(1, 2)
-    for i, results in enumerate(all_results):
-        if curve := results.get("learning"):
+    for i, group in enumerate(groups):
+        curves = [curve for results in group if (curve := results.get("learning"))]
+        for k, curve in enumerate(curves):
             samples = np.array(curve["samples"]) / 1e6
             for axes, name in ((left, "episode_length"), (right, "velocity_error_mps")):
                 values = np.array(curve[name], dtype=float)  # None becomes NaN
-                axes.plot(samples, values, color=color(i, results["label"]), lw=1.4, label=named(results))
+                label = named(group[0]) if k == 0 else None
+                axes.plot(samples, values, color=color(i, group[0]["label"]), lw=1.4 / len(curves) ** 0.5, label=label)
     left.set(xlabel="million samples", ylabel="policy steps", title="Length of training episodes", ylim=(0, None))
     right.set(xlabel="million samples", ylabel="m/s", title="Velocity error in training", ylim=(0, None))
     right.legend(**BESIDE)

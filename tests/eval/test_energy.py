@@ -1,5 +1,7 @@
 """The cost of transport, split by joint, phase and sign."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -15,13 +17,14 @@ def rollout(power: np.ndarray, net: np.ndarray, feet: np.ndarray, names: tuple[s
     steps, joints = power.shape
     qpos, qvel = np.zeros((steps, 1, 7)), np.zeros((steps, 1, 6))
     qpos[..., 3], qvel[..., 0] = 1.0, 0.5
-    nothing = np.zeros((steps, 1, joints), np.float32)
-    return Rollout(
-        0.02, WEIGHT, names, (), qpos.astype(np.float32), qvel.astype(np.float32),
-        *(nothing,) * 3, power[:, None].astype(np.float32), net[:, None].astype(np.float32), feet[:, None].astype(np.float32),
-        *(np.zeros((steps, 1, n), np.float32) for n in (3, 2, 3)), *(np.zeros((steps, 1), np.float32),) * 2,
-        np.zeros((steps, 1, 0), np.float32), np.zeros((steps, 1), bool),
-    )  # fmt: skip
+    arrays = {"joint_power": power, "joint_net_power": net, "foot_force": feet, "fallen": np.zeros(steps, bool)}
+    arrays |= {name: np.zeros((steps, joints)) for name in ("joint_pos", "joint_target", "joint_force")}
+    arrays |= {
+        name: np.zeros((steps, size)) for name, size in (("push_w", 3), ("phase", 2), ("command", 3), ("reward_terms", 0))
+    }
+    arrays |= {name: np.zeros(steps) for name in ("reference_heading", "reward")}
+    one_world: dict[str, Any] = {name: array[:, None] for name, array in arrays.items()}
+    return Rollout(step_dt=0.02, weight=WEIGHT, joint_names=names, reward_names=(), qpos=qpos, qvel=qvel, **one_world)
 
 
 def test_every_joule_has_one_place() -> None:

@@ -175,7 +175,7 @@ def test_the_report_takes_any_number_of_commands_and_a_single_world(results: dic
     speed = results["series"]["speed"]
     many = {"time_s": speed["time_s"], **{f"{0.05 * i:g}": speed["0.7"] for i in range(12)}}
     alone = [row | {"ci95_mps": float("nan")} for row in results["tracking"]]
-    write_report([results | {"series": results["series"] | {"speed": many}, "tracking": alone}], tmp_path, "Many")
+    write_report([[results | {"series": results["series"] | {"speed": many}, "tracking": alone}]], tmp_path, "Many")
     assert "nan" not in (tmp_path / "report.md").read_text()
 
 
@@ -187,40 +187,40 @@ def test_a_walk_has_a_step_at_least(candidate: Candidate, robot: Robot) -> None:
 
 
 def test_the_report_shows_the_numbers_beside_the_articles_in_one_file(results: dict[str, Any], tmp_path: Path) -> None:
-    write_report([results], tmp_path, "How <it> walks", "First.\n\nSecond.", references())
+    write_report([[results]], tmp_path, "How <it> walks", "First.\n\nSecond.", references())
     markdown, page = ((tmp_path / f"report.{suffix}").read_text() for suffix in ("md", "html"))
     speed = f"{results['tracking'][1]['mean_speed_mps']:.3f}"
     for text in (markdown, page):
         assert speed in text
         assert "0.693" in text  # the article's mean speed at 0.7 m/s
         assert "angular momentum" in text
-    assert page.count("<svg") == 6  # cost of transport, omni, terrain, speed, feet, joints; no push of ten seconds
+    assert page.count("<svg") == 8  # cost, energy, omni, terrain, speed, feet, joints, energy by speed; no push of ten seconds
     assert "How &lt;it&gt; walks" in page
     assert not re.search(r"(src|href)=\"http", page)  # complete in itself
-    assert re.findall(r"!\[.*\]\((.*)\)", markdown) == ["cost_of_transport.svg", "omni.svg", "terrain.svg"]
+    assert re.findall(r"!\[.*\]\((.*)\)", markdown) == ["cost_of_transport.svg", "energy.svg", "omni.svg", "terrain.svg"]
     assert (tmp_path / "cost_of_transport.svg").read_text().startswith("<svg")
 
 
 def test_who_falls_has_no_bar_in_the_cost_of_transport(results: dict[str, Any]) -> None:
     fallen = results | {"label": "falls", "tracking": [row | {"falls": row["worlds"]} for row in results["tracking"]]}
-    figure = plots.cost_of_transport([results, fallen])
+    figure = plots.cost_of_transport([[results], [fallen]])
     assert figure.axes[0].get_legend_handles_labels()[1] == [results["label"]]
 
 
 def test_a_label_is_shown_as_it_is_written(results: dict[str, Any]) -> None:
     odd = [results | {"label": label} for label in ("cost $a_$", "_hidden", "$_^{", "5 $")]
-    figure = plots.cost_of_transport(odd)
+    figure = plots.cost_of_transport([[one] for one in odd])
     legend = figure.axes[0].get_legend()
     assert legend is not None
     assert [text.get_text() for text in legend.get_texts()] == [r"cost \$a_\$", " _hidden", r"\$_^{", r"5 \$"]
     assert plots.svg(figure).startswith("<svg")
     for one in odd:
-        for draw in (plots.speed, plots.feet, plots.joints):
+        for draw in (plots.speed, plots.feet, plots.joints, plots.energy_by_speed):
             assert plots.svg(draw(one)).startswith("<svg")
 
 
 def test_the_same_numbers_give_the_same_picture(results: dict[str, Any]) -> None:
-    assert plots.svg(plots.cost_of_transport([results])) == plots.svg(plots.cost_of_transport([results]))
+    assert plots.svg(plots.cost_of_transport([[results]])) == plots.svg(plots.cost_of_transport([[results]]))
 
 
 def test_broken_results_are_named(tmp_path: Path) -> None:
@@ -264,7 +264,7 @@ def test_a_robot_with_other_joints_is_measured_too(name: str, has_prismatic_knee
         assert tuple(row["cot_joints"]) == robot.joint_names
     assert (results["gait"]["knee_stroke_m"] >= 0.0) == has_prismatic_knees  # else it is NaN
     write_results(results, tmp_path)
-    write_report([results], tmp_path, name)
+    write_report([[results]], tmp_path, name)
     assert can_be_shown(read_results(tmp_path / "results.json"))
 
 
