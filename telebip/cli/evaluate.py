@@ -77,7 +77,7 @@ def measure(console, candidate, suites: Sequence[str], protocol, out: Path) -> d
 
     robot = checked_robot(candidate.task)
     make_folder(out)
-    with progress_bar(console) as show:
+    with progress_bar(console, announce=True) as show:
         results = evaluate(candidate, robot, suites, protocol, show)
     write_results(results, out)
     return results
@@ -157,8 +157,11 @@ def references() -> list[dict]:
 
 
 @contextmanager
-def progress_bar(console):
-    """Yield a function that shows what is running, how long it will take and how far it is, whole on 60 columns."""
+def progress_bar(console, announce: bool = False):
+    """Yield a function that shows what is running, how long it will take and how far it is, whole on 60 columns.
+
+    Where there is no terminal it shows nothing, or, with `announce`, a line as something begins.
+    """
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     columns = (TextColumn("{task.description}"), TextColumn("eta"), TimeRemainingColumn(), BarColumn(20), TimeElapsedColumn())
@@ -168,6 +171,8 @@ def progress_bar(console):
         def show(name: str, step: int, total: int) -> None:
             if name not in tasks:
                 tasks[name] = progress.add_task(name, total=total)
+                if announce and not console.is_terminal:
+                    console.print(f"{name} ...")
             progress.update(tasks[name], completed=step, total=total)
 
         yield show

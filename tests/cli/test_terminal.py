@@ -25,6 +25,14 @@ def test_the_progress_of_a_measurement_is_whole(width: int) -> None:
     assert "…" not in screen.getvalue()
 
 
+def test_a_pipe_gets_a_line_as_a_measurement_begins() -> None:
+    console = Console(file=io.StringIO(), force_terminal=False)
+    with progress_bar(console, announce=True) as show:
+        show("walking", 1, 2)
+        show("walking", 2, 2)
+    assert console.file.getvalue() == "walking ...\n"  # type: ignore[attr-defined]
+
+
 @pytest.mark.parametrize("width", WIDTHS)
 def test_the_summary_of_a_measurement_fits_the_terminal(width: int) -> None:
     lines = summary(RESULTS, width).splitlines()
