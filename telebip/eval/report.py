@@ -355,7 +355,8 @@ def _push_cells(parts: Sequence[dict[str, Any]]) -> list[str]:
     names = ("forward", "backward", "lateral")
     shares = [share for share in parts[0].get("shares", {}).values() if share] if len(parts) == 1 else []
     return [
-        *(over_seeds([part.get(f"{name}{suffix}") for part in parts], 0) for suffix in ("_n", "_95_n") for name in names),
+        *(over_seeds([part[f"{name}_n"] for part in parts], 0) for name in names),
+        *(over_seeds([part.get(f"{name}_95_n") for part in parts], 0) for name in names),
         " / ".join(f"{s['share']:.3f} [{s['share_low']:.3f}, {s['share_high']:.3f}]" for s in shares) or "-",
         " / ".join(over_seeds([part.get(f"{name}_ns") for part in parts], 1) for name in names),
         " / ".join(over_seeds([part.get(f"{name}_bw") for part in parts], 2) for name in names),

@@ -11,6 +11,8 @@ from test_commands_line import ran, refusal
 
 from telebip.cli import evaluate, reproduce
 from telebip.cli.console import Console
+from telebip.eval.report import BEGIN, END
+from telebip.rl.checkpoint import load_checkpoint
 
 EVALUATE, REPRODUCE = "scripts/evaluate.py", "scripts/reproduce.py"
 SMALL = ("--num-envs", "2", "--duration", "2", "--device", "cpu")
@@ -19,7 +21,8 @@ SMALL = ("--num-envs", "2", "--duration", "2", "--device", "cpu")
 def test_evaluate_writes_results_and_reports(tmp_path: Path) -> None:
     policy = ("--checkpoint", "assets/policies/telebip_flat", "--suite", "tracking,gait", "--commands", "0.7")
     printed = ran(EVALUATE, *policy, *SMALL, "--out", str(tmp_path), "--label", "mine", run=fresh)
-    assert {file.name for file in tmp_path.iterdir()} == {"results.json", "report.md", "report.html", "cost_of_transport.svg"}
+    pictures = {"cost_of_transport.svg", "energy.svg"}
+    assert {file.name for file in tmp_path.iterdir()} == {"results.json", "report.md", "report.html", *pictures}
     results = json.loads((tmp_path / "results.json").read_text())
     assert (results["label"], [row["command_mps"] for row in results["tracking"]]) == ("mine", [0.7])
     assert "push" not in results
@@ -61,10 +64,9 @@ def test_a_report_without_a_folder_stays_in_reports(label: str, folder: str) -> 
         ([EVALUATE, "--controller", "dcm", "events.start_pose.heading=3"], "robots that face x"),
         ([REPRODUCE, "--only", "telebip_flta"], "did you mean 'telebip_flat'?"),
         ([REPRODUCE, "--seeds", "0"], "--seeds must be 1 or more, got 0"),
-        (
-            [REPRODUCE, "--shipped", "--seeds", "2"],
-            "the one policy that there is of each; leave out --seeds",
-        ),
+        ([REPRODUCE, "--jobs", "0"], "--jobs must be 1 or more, got 0"),
+        ([REPRODUCE, "--shipped", "--seeds", "2"], "the one policy that there is of each; leave out --seeds"),
+        ([REPRODUCE, "--shipped", "--ship"], "leave out --ship"),
     ],
     ids=lambda value: " ".join(value[1:]) if isinstance(value, list) else "",
 )
@@ -94,60 +96,55 @@ def test_signs_that_the_terminal_lacks_stop_nothing(monkeypatch: pytest.MonkeyPa
 
 
 def test_the_study_at_toy_size_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    page = tmp_path / "out.md"
+    page.write_text(f"Before.\n{BEGIN}\nold\n{END}\nAfter.\n")
     where = ("--quick", "--device", "cpu", "--out", str(tmp_path / "out"), "--runs", str(tmp_path / "runs"))
-    only = ("--only", "telebip_efficient", "period_06", "dcm")
+    only = ("--only", "telebip_efficient", "period_06", "dcm", "--seeds", "2", "--ship")
     ran(REPRODUCE, *where, *only, run=fresh)
-    assert {path.name for path in (tmp_path / "runs").iterdir()} == {"telebip_efficient-seed1", "period_06-seed1"}
+    runs = tmp_path / "runs"
+    assert {path.name for path in runs.glob("seed1/*")} == {
+        f"{t}{s}" for t in ("telebip_efficient", "period_06") for s in ("", ".log")
+    }
     report = (tmp_path / "out" / "report.md").read_text()
-    for label in ("RL, efficient", "RL, period 0.6 s", "DCM", "article: RL"):
+    for label in ("| RL, efficient | 2 seeds |", "| RL, period 0.6 s | 2 seeds |", "| DCM | - |", "| article: RL | - |"):
         assert label in report
-    results = tmp_path / "out" / "telebip_efficient" / "results.json"
+    first, second = (
+        json.loads((tmp_path / "out" / "period_06" / seed / "results.json").read_text()) for seed in ("seed1", "seed2")
+    )
+    assert first["fingerprint"] != second["fingerprint"]
+    assert first["training"]["task"] == second["training"]["task"]
+    assert [results["training"]["seed"] for results in (first, second)] == [1, 2]
+    text = page.read_text()
+    assert text.startswith("Before.\n") and text.endswith("After.\n") and "old" not in text
+    assert "| RL, efficient | 2 seeds |" in text
+    shipped = runs / "shipped" / "period_06"
+    assert load_checkpoint(shipped).task == "period_06"
+    assert "/" not in json.dumps(json.loads((shipped / "run.json").read_text())["starts"][0]["command"]).replace("scripts/", "")
+    results = tmp_path / "out" / "telebip_efficient" / "seed1" / "results.json"
     written = results.stat().st_mtime_ns
     again = ran(REPRODUCE, *where, *only)
-    assert again.count("trained already") == 2
-    assert again.count("measured already") == 3
+    assert again.count("training, log in") == 0
+    assert again.count("measured already") == 5
     assert results.stat().st_mtime_ns == written
 
 
 @pytest.mark.slow
 def test_results_that_lack_something_are_measured_again_or_named(tmp_path: Path) -> None:
     where = ("--quick", "--device", "cpu", "--out", str(tmp_path), "--runs", str(tmp_path / "runs"), "--only", "dcm")
-    older = {"schema": "telebip-results-1", "label": "older", "push": None, "tracking": [{"command_mps": 0.5}]}
-    files = {name: tmp_path / name / "results.json" for name in ("dcm", "period_06")}
+    older = {"schema": "telebip-results-2", "label": "older", "push": None, "tracking": [{"command_mps": 0.5}]}
+    files = {name: tmp_path / name / "results.json" for name in ("dcm", "period_06/seed1")}
     for file in files.values():
-        file.parent.mkdir()
+        file.parent.mkdir(parents=True)
         file.write_text(json.dumps(older))
-    assert f"results '{files['period_06']}' lack some" in refusal(REPRODUCE, *where)
+    assert f"results '{files['period_06/seed1']}' lack some" in refusal(REPRODUCE, *where)
     assert json.loads(files["dcm"].read_text())["label"] == "DCM"
-    files["period_06"].unlink()
+    files["period_06/seed1"].unlink()
     assert "dcm: measured already" in ran(REPRODUCE, *where)
     files["dcm"].write_text("{")
     assert "dcm: measured\n" in ran(REPRODUCE, *where)
-
-
-def test_other_seeds_are_left_out_of_the_report_of_what_is_shipped(tmp_path: Path) -> None:
-    for name in ("period_06", "period_06-seed2"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "results.json").touch()
-    names = [[file.parent.name for file in reproduce._measured(tmp_path, "period_06", seeds)] for seeds in (False, True)]
-    assert names == [["period_06"], ["period_06", "period_06-seed2"]]
 
 
 def test_the_toy_study_keeps_apart_from_the_real_one() -> None:
     toy, real = reproduce._parse(["--quick"]), reproduce._parse([])
     assert (real.out, real.runs) == ("docs/results", "runs/study")
     assert (toy.out, toy.runs) == ("runs/study_quick/results", "runs/study_quick")
-
-
-@pytest.mark.slow
-def test_the_study_from_two_seeds_reports_both(tmp_path: Path) -> None:
-    where = ("--quick", "--device", "cpu", "--out", str(tmp_path / "out"), "--runs", str(tmp_path / "runs"))
-    ran(REPRODUCE, *where, "--only", "period_06", "--seeds", "2")
-    assert {path.name for path in (tmp_path / "runs").iterdir()} == {"period_06-seed1", "period_06-seed2"}
-    report = (tmp_path / "out" / "report.md").read_text()
-    assert "RL, period 0.6 s (2 seeds)" in report
-    assert report.count("| RL, period 0.6 s, seed 2 |") == report.count("| RL, period 0.6 s |") > 0
-    first, second = (
-        json.loads((tmp_path / "out" / name / "results.json").read_text()) for name in ("period_06", "period_06-seed2")
-    )
-    assert first["fingerprint"] != second["fingerprint"]

@@ -24,7 +24,8 @@ def rollout(power: np.ndarray, net: np.ndarray, feet: np.ndarray, names: tuple[s
     }
     arrays |= {name: np.zeros(steps) for name in ("reference_heading", "reward")}
     one_world: dict[str, Any] = {name: array[:, None] for name, array in arrays.items()}
-    return Rollout(step_dt=0.02, weight=WEIGHT, joint_names=names, reward_names=(), qpos=qpos, qvel=qvel, **one_world)
+    one_world |= {"qpos": qpos, "qvel": qvel}
+    return Rollout(step_dt=0.02, weight=WEIGHT, joint_names=names, reward_names=(), **one_world)
 
 
 def test_every_joule_has_one_place() -> None:
