@@ -88,7 +88,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 def _run(training: "Training", seed: int, options: argparse.Namespace) -> Run:
     overrides = QUICK_TRAINING if options.quick else ()
     config = replace(load_task(training.name, overrides), seed=seed)
-    return Run(training.name, seed, config, Path(options.runs), overrides)
+    return Run(training.name, seed, config, Path(options.runs), overrides, options.allow_robot_change)
 
 
 def _measurements(
@@ -120,6 +120,9 @@ def _measure_all(
             policy = str(run_dir / "policy.pt") if run_dir else ""
             candidate = checkpoint_candidate(policy, training.label, (), options.allow_robot_change)
             place = out / training.name / (name or f"seed{candidate.config.seed}")
+            if not options.shipped:  # how to have it again; the run's folder is of this machine
+                again = f"reproduce.py --only {training.name} --seeds {candidate.config.seed}"
+                candidate = replace(candidate, source=again)
             _measure(console, place, training, options, candidate)
             progress.measured(f"{training.name}, {place.name}", training.name)
     for baseline in baselines:

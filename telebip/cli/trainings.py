@@ -26,6 +26,7 @@ class Run:
     config: TaskConfig  # what the command trains
     runs: Path  # where all trainings go
     overrides: tuple[str, ...] = ()
+    allow_robot_change: bool = False
     process: subprocess.Popen[bytes] | None = None
     is_told: bool = False  # to stop
     _found: Path | None = None
@@ -82,7 +83,7 @@ class Run:
         """Return the command that begins the training, or goes on with it."""
         run_dir = self.run_dir
         if run_dir and any(run_dir.glob("model_*.pt")):
-            arguments = ["--resume", str(run_dir)]
+            arguments = ["--resume", str(run_dir), *(["--allow-robot-change"] * self.allow_robot_change)]
         else:
             arguments = ["--task", self.task, "--seed", str(self.seed), "--log-dir", str(self.log_dir), *self.overrides]
         return [sys.executable, "-m", "telebip.cli.main", "train", *arguments, "--device", device]
