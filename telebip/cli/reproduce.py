@@ -74,6 +74,7 @@ def main(argv: Sequence[str] | None = None) -> None:
                 if asked():
                     console.print("stopped; the same command goes on")
                     return
+        progress.stop()
         _measure_all(console, progress, trainings, baselines, runs, options)
     if options.ship:
         for training in trainings:
@@ -124,11 +125,11 @@ def _measure_all(
                 again = f"reproduce.py --only {training.name} --seeds {candidate.config.seed}"
                 candidate = replace(candidate, source=again)
             _measure(console, place, training, options, candidate)
-            progress.measured(f"{training.name}, {place.name}", training.name)
+            progress.measured(training.name)
     for baseline in baselines:
         candidate = controller_candidate(baseline.controller, baseline.label, baseline.overrides)
         _measure(console, out / baseline.name, baseline, options, candidate)
-        progress.measured(baseline.name, baseline.name)
+        progress.measured(baseline.name)
 
 
 def _measure(
@@ -238,7 +239,7 @@ class StudyProgress:
         self._left = dict(measurements)
         self._trained = {run.name: run.total if run.is_finished else run.samples() for run in runs}
         self._goal = sum(run.total for run in runs) + sum(measurements.values())
-        self._total = bar.add_task("the study", total=self._goal)
+        self._total = bar.add_task("the study", total=self._goal, eta="")
         self._lines: dict[str, Any] = {}
         self._began, self._before, self._said = time.monotonic(), self._done(), 0.0
 
@@ -252,25 +253,26 @@ class StudyProgress:
             self._bar.remove_task(self._lines.pop(name))
         for run in at_work:
             if run.name not in self._lines:
-                self._lines[run.name] = self._bar.add_task(run.name, total=run.total)
+                self._lines[run.name] = self._bar.add_task(run.name, total=run.total, eta="")
             self._bar.update(self._lines[run.name], completed=self._trained[run.name])
         self._update()
 
-    def measured(self, name: str, walker: str) -> None:
-        """Show that one more policy of a walker is measured."""
-        for line in [line for line in self._lines.values()]:
-            self._bar.remove_task(line)
-        self._lines = {}
-        key = next(key for key in self._left if key.split("/")[0] == walker)
-        del self._left[key]
-        self._update()
+    def stop(self) -> None:
+        """Take the bars away: the trainings are over, and measuring has a bar of its own."""
+        self._bar.stop()
+
+    def measured(self, walker: str) -> None:
+        """Say how far the study is, now that one more policy of a walker is measured."""
+        del self._left[next(key for key in self._left if key.split("/")[0] == walker)]
+        done = self._done()
+        self._console.print(f"{100.0 * done / self._goal:.0f} % of the study, eta {self._eta(done)}")
 
     def _done(self) -> float:
         return sum(self._trained.values()) + self._goal - sum(run.total for run in self._runs) - sum(self._left.values())
 
     def _update(self) -> None:
         done, now = self._done(), time.monotonic()
-        self._bar.update(self._total, completed=done, eta=self._eta(done))
+        self._bar.update(self._total, completed=done, eta=f"eta {self._eta(done)}")
         if not self._console.is_terminal and now - self._said > 60.0:
             self._said = now
             self._console.print(f"{100.0 * done / self._goal:.0f} % of the study, eta {self._eta(done)}")
