@@ -19,6 +19,7 @@ from telebip.config import to_yaml
 from telebip.errors import UserError
 from telebip.files import write_atomically
 from telebip.mdp.actions import scales
+from telebip.mdp.binding import find_term
 from telebip.rl.checkpoint import Checkpoint
 from telebip.rl.onnx import INPUT, OUTPUT, OnnxPolicy, set_metadata
 from telebip.rl.policy import load_network
@@ -26,6 +27,21 @@ from telebip.rl.run import git_revision
 from telebip.rl.symmetry import Canonical, SymmetricPolicy
 from telebip.robot import Robot, load_robot
 from telebip.robot_record import describe_robot
+
+MEASUREMENTS = {
+    "joint_pos": ("rad | m", "of each joint, in the order of joint_names, zero as in the MJCF"),
+    "joint_vel": ("rad/s | m/s", "of each joint"),
+    "lin_vel": ("m/s", "of the trunk's frame, midway between the hips, in that frame"),
+    "ang_vel": ("rad/s", "of the trunk, in its frame"),
+    "quat": ("w x y z", "of the trunk in a frame whose z points up; its heading may start anywhere, and drift"),
+}
+"""What a robot may have to measure: unit and frame."""
+
+NEEDS = {
+    **{"joint_pos": "joint_pos", "joint_vel": "joint_vel", "base_lin_vel": "lin_vel", "base_ang_vel": "ang_vel"},
+    **{"base_quat": "quat", "projected_gravity": "quat"},
+}
+"""Which of these an observation is made of; others are measured as they are."""
 
 TOLERANCE = 1e-5
 """Largest difference between the actions of ONNX and torch that an export may show [-]; see `largest_difference`."""
@@ -62,7 +78,7 @@ def export(checkpoint: Checkpoint, path: Path, samples: int = 10_000) -> float:
 def describe(checkpoint: Checkpoint, robot: Robot) -> dict[str, Any]:
     """Return what one has to know to run the policy on a robot or in another simulator. Lists follow `joint_names`.
 
-    Delays of actions and observations, and noise, are the training's and not a part of it.
+    Delays and noise are those of the training: what the policy bears, not what a robot should add.
 
     Raises:
         UserError: the robot has other joints than the policy moves.
@@ -87,6 +103,17 @@ def describe(checkpoint: Checkpoint, robot: Robot) -> dict[str, Any]:
             for part in checkpoint.observations["policy"]
         ],
         "history": config.observations["policy"].history,  # frames that it takes, one of each policy step, the newest first
+        "measures": measures(checkpoint),
+        # By how much actions and observations were late in training, from the least to the most [s].
+        "action_delay": [
+            round(robot.physics_dt * (config.sim.decimation * late + more + jitter), 9)
+            for late, more, jitter in zip(
+                config.actions.delay, config.actions.physics_delay, config.actions.jitter, strict=True
+            )
+        ],
+        "observation_delay": [
+            round(robot.physics_dt * config.sim.decimation * late, 9) for late in config.observations["policy"].delay
+        ],
         "physics_dt": robot.physics_dt,  # s
         "step_dt": robot.physics_dt * config.sim.decimation,  # s
         "gait_period": config.gait.period,  # s
@@ -103,6 +130,35 @@ def describe(checkpoint: Checkpoint, robot: Robot) -> dict[str, Any]:
         "config": to_yaml(config),
         "robot": describe_robot(robot, config.sim.decimation),
     }
+
+
+def measures(checkpoint: Checkpoint) -> list[dict[str, Any]]:
+    """Return what a robot must measure for the policy: each with its unit, its frame and what needs it.
+
+    `noise` is the largest amplitude with which the policy was trained, in the unit of the observation.
+    """
+    policy, commands = checkpoint.config.observations["policy"], checkpoint.config.commands
+    found: dict[str, dict[str, Any]] = {}
+
+    def need(name: str, unit: str, frame: str, user: str, noise: float) -> None:
+        entry = found.setdefault(name, {"name": name, "unit": unit, "frame": frame, "for": [], "noise": 0.0})
+        entry["for"].append(user)
+        entry["noise"] = max(entry["noise"], noise)
+
+    for part in checkpoint.observations["policy"]:
+        params = policy.terms[part["name"]]
+        term = find_term("observation", part["name"], params)
+        if term.is_sensed:
+            name = NEEDS.get(term.name, part["name"])
+            unit, frame = MEASUREMENTS.get(name, (part["unit"], ""))
+            need(name, unit, frame, part["name"], params["noise"] if policy.noise else 0.0)
+    if any(part["name"] == "command" for part in checkpoint.observations["policy"]):
+        holds = {"quat": ("heading hold", commands.heading_gain), "lin_vel": ("velocity hold", commands.velocity_gain)}
+        for name, (user, gain) in holds.items():
+            if gain:
+                unit, frame = MEASUREMENTS[name]
+                need(name, unit, frame, user, 0.0)
+    return list(found.values())
 
 
 def largest_difference(policy: MLPModel | SymmetricPolicy, exported: OnnxPolicy, samples: int) -> float:

@@ -22,6 +22,7 @@ from telebip.eval.push import PushProtocol
 from telebip.eval.report import can_be_shown, read_results, write_report, write_results
 from telebip.eval.suites import SUITES, Candidate, Protocol, check_suites, commands_of, evaluate, is_current, make_env
 from telebip.eval.terrain import LEVELS, TYPES, TerrainProtocol
+from telebip.eval.transfer import TransferProtocol
 from telebip.robot import Robot, load_robot
 
 POLICY = "assets/policies/telebip_flat"
@@ -35,6 +36,7 @@ PROTOCOL = Protocol(
     push=PushProtocol(max_force=10.0, worlds=1, limit_worlds=2, warmup=1.0, horizons=(1.0, 2.0), num_envs=8),
     omni=OMNI,
     terrain=TerrainProtocol(worlds=1),
+    transfer=TransferProtocol(worlds=2, points=2, sweep_worlds=2, duration=1.0, skip=0.2),
 )
 
 
@@ -149,6 +151,7 @@ def test_results_are_current_for_the_same_candidate_measured_in_the_same_way(
     assert not is_current(back, candidate, SUITES, dataclasses.replace(PROTOCOL, push=PushProtocol()))
     assert not is_current(back, candidate, SUITES, dataclasses.replace(PROTOCOL, omni=OmniProtocol()))
     assert not is_current(back, candidate, SUITES, dataclasses.replace(PROTOCOL, terrain=TerrainProtocol()))
+    assert not is_current(back, candidate, SUITES, dataclasses.replace(PROTOCOL, transfer=TransferProtocol()))
     assert not is_current(back, dataclasses.replace(candidate, fingerprint="of another"), SUITES, PROTOCOL)
     assert not is_current({key: value for key, value in back.items() if key != "gait"}, candidate, SUITES, PROTOCOL)
 
@@ -194,10 +197,18 @@ def test_the_report_shows_the_numbers_beside_the_articles_in_one_file(results: d
         assert speed in text
         assert "0.693" in text  # the article's mean speed at 0.7 m/s
         assert "angular momentum" in text
-    assert page.count("<svg") == 8  # cost, energy, omni, terrain, speed, feet, joints, energy by speed; no push of ten seconds
+    assert (
+        page.count("<svg") == 9
+    )  # cost, energy, omni, terrain, transfer, speed, feet, joints, energy by speed; no push of ten seconds
     assert "How &lt;it&gt; walks" in page
     assert not re.search(r"(src|href)=\"http", page)  # complete in itself
-    assert re.findall(r"!\[.*\]\((.*)\)", markdown) == ["cost_of_transport.svg", "energy.svg", "omni.svg", "terrain.svg"]
+    assert re.findall(r"!\[.*\]\((.*)\)", markdown) == [
+        "cost_of_transport.svg",
+        "energy.svg",
+        "omni.svg",
+        "terrain.svg",
+        "transfer.svg",
+    ]
     assert (tmp_path / "cost_of_transport.svg").read_text().startswith("<svg")
 
 
