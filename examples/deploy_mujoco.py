@@ -5,7 +5,7 @@
     python examples/deploy_mujoco.py policy.onnx assets/telebip.xml --command 0.7 0 0
 
 `Policy` is what runs on a robot's computer: it takes sensor readings and returns joint targets, and all it knows comes from
-the ONNX file: what is observed, how many of the latest frames, and what a robot must measure. `SimulatedRobot` is what a robot's
+the ONNX file: what is observed, how many of the latest frames, what a robot must measure. `SimulatedRobot` is what a robot's
 drivers would replace: encoders, an inertial measurement unit, an estimate of the velocity where the policy sees one, and
 position controllers with the gains and limits of the file. A model whose joints and sensors have names of their own:
 
@@ -113,7 +113,7 @@ class Policy:
             "joint_pos": readings.joint_pos - self._nominal,
             "joint_vel": readings.joint_vel,
             "last_action": self._last_action,
-            "base_lin_vel": readings.lin_vel,
+            "base_lin_vel": np.zeros(3) if readings.lin_vel is None else readings.lin_vel,  # not there: not seen
             "base_ang_vel": readings.ang_vel,
             "base_quat": relative_to_heading(readings.quat, self._reference_heading),
             "projected_gravity": to_body(np.array([0.0, 0.0, -1.0]), readings.quat),
@@ -144,13 +144,13 @@ class SimulatedRobot:
             sensors: which sensor of the MJCF measures "ang_vel", "quat" or "lin_vel"; the truth is told where none is named.
             delay: by which targets reach the motors late [s].
         """
-        names = names or {}
+        own = dict(names or {})
         self.model = mujoco.MjModel.from_xml_path(str(file))
         self.data = mujoco.MjData(self.model)
         self.model.opt.timestep = about["physics_dt"]
         if self.model.njnt == 0 or self.model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
             raise SystemExit(f"{file}: the first joint must be a free joint, that of the trunk")
-        joints = [self._joint(names.get(name, name), file) for name in about["joint_names"]]
+        joints = [self._joint(own.get(str(name), str(name)), file) for name in about["joint_names"]]
         self._sensors = {what: self._sensor(what, name, file) for what, name in (sensors or {}).items()}
         self._qpos, self._qvel = [joint.qposadr[0] for joint in joints], [joint.dofadr[0] for joint in joints]
         self._motors = [self._motor(joint, file) for joint in joints]

@@ -149,7 +149,7 @@ def measures(checkpoint: Checkpoint) -> list[dict[str, Any]]:
         params = policy.terms[part["name"]]
         term = find_term("observation", part["name"], params)
         if term.is_sensed:
-            name = NEEDS.get(term.name, part["name"])
+            name = NEEDS.get(term.name, str(part["name"]))
             unit, frame = MEASUREMENTS.get(name, (part["unit"], ""))
             need(name, unit, frame, part["name"], params["noise"] if policy.noise else 0.0)
     if any(part["name"] == "command" for part in checkpoint.observations["policy"]):
