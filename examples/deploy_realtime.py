@@ -1,4 +1,4 @@
-# pyright: reportAttributeAccessIssue=false
+# pyright: reportAttributeAccessIssue=false, reportCallIssue=false, reportArgumentType=false
 """Walk an exported policy in real time: its 50 Hz loop in one process, a robot with a 1 kHz motor loop in another.
 
     python scripts/export.py --checkpoint assets/policies/telebip_efficient --out policy.onnx

@@ -1,3 +1,4 @@
+# pyright: reportAttributeAccessIssue=false
 """The robot with rotary knees: alike the telescopic one in all that the comparison holds equal."""
 
 import mujoco

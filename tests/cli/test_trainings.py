@@ -1,5 +1,6 @@
 """Trainings side by side, as processes: they are stopped with checkpoints, gone on with, and say what went wrong."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,7 +27,7 @@ def test_a_stop_leaves_checkpoints_and_the_same_call_goes_on_to_the_same_policy(
     run = make_run(tmp_path / "stopped", 1, "ppo.max_iterations=60")
     is_asked = False
 
-    def show(at_work: list[Run]) -> None:
+    def show(at_work: Sequence[Run]) -> None:
         nonlocal is_asked
         is_asked |= any(run.samples() >= 80 for run in at_work)
 

@@ -1,3 +1,4 @@
+# pyright: reportAttributeAccessIssue=false
 """The idealised floor of the cost of transport: the formulas of docs/evaluation.md, with the numbers of the robot's MJCF."""
 
 import re
