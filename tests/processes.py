@@ -19,9 +19,9 @@ FORKS.set_forkserver_preload(
 Done = subprocess.CompletedProcess[str]
 
 
-def fresh(script: str, *arguments: str) -> Done:
+def fresh(script: str, *arguments: str, timeout: float = 120.0) -> Done:
     """Run a script with an interpreter of its own, which takes seconds to import torch."""
-    return subprocess.run([sys.executable, script, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    return subprocess.run([sys.executable, script, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=timeout)
 
 
 def forked(script: str, *arguments: str, cwd: Path = ROOT) -> Done:

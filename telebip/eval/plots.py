@@ -130,9 +130,10 @@ def _bars(
         x = [at + (i - 0.5 * (len(shown) - 1)) * width for at in heights[k]]
         found = [estimate(values) for values in heights[k].values()]
         tone = color(k, groups[k][0]["label"])
-        bars = axes.bar(x, [one.value for one in found], 0.92 * width, color=tone, label=named(groups[k][0]))
-        axes.bar_label(bars, fmt=digits, fontsize=7, padding=1)
+        axes.bar(x, [one.value for one in found], 0.92 * width, color=tone, label=named(groups[k][0]))
         for at, one, values in zip(x, found, heights[k].values(), strict=True):
+            place = {"xy": (at, max(values)), "xytext": (0, 2), "textcoords": "offset points"}
+            axes.annotate(digits % one.value, **place, ha="center", fontsize=7)
             if len(values) > 1:
                 axes.plot([at] * len(values), values, "o", color="black", ms=2.0, alpha=0.6)
             if np.isfinite(one.low):

@@ -259,7 +259,8 @@ def _tables(groups: Sequence[Group]) -> list[Table]:
 def _summary(groups: Sequence[Group]) -> list[Table]:
     """Return the tables of docs/results.md: cost of transport, speed errors and falls; and pushes."""
     tracked, pushed = _with("tracking", groups), _with("push", groups)
-    commands = sorted({row["command_mps"] for _, parts in tracked for part in parts for row in part}, reverse=True)
+    measured = {row["command_mps"] for _, parts in tracked for part in parts for row in part}
+    commands = sorted(measured, key=lambda command: (command < 0.0, abs(command)))
     walking = [*WHO, *(f"COT at {command:g} m/s" for command in commands), "largest error of the mean speed", "falls"]
     horizons = sorted({name for _, parts in pushed for name in parts[0] if _is_horizon(name)}, key=_seconds)
     header = [f"{name}, {horizon.removesuffix('s')} s" for horizon in horizons for name in ("95 % survive", "all survive")]

@@ -3,6 +3,7 @@
 import io
 import json
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -100,7 +101,7 @@ def test_the_study_at_toy_size_goes_on_where_it_stopped(tmp_path: Path) -> None:
     page.write_text(f"Before.\n{BEGIN}\nold\n{END}\nAfter.\n")
     where = ("--quick", "--device", "cpu", "--out", str(out), "--runs", str(runs))
     only = ("--only", "period_06", "dcm", "--seeds", "2", "--ship")
-    ran(REPRODUCE, *where, *only, run=fresh)
+    ran(REPRODUCE, *where, *only, run=partial(fresh, timeout=600.0))  # which imports torch three times over
     assert {path.name for path in runs.glob("seed*/*")} == {"period_06", "period_06.log"}
     report = (out / "report.md").read_text()
     for label in ("| RL, period 0.6 s | 2 seeds |", "| DCM | - |", "| article: RL | - |"):
