@@ -57,7 +57,7 @@ class Shared:
         """Make room for readings, targets and clocks."""
         self._lock = SPAWN.Lock()
         self._n = num_joints
-        self._numbers = SPAWN.Array(ctypes.c_double, 2 * num_joints + 10 + num_joints, lock=False)
+        self._numbers = SPAWN.RawArray(ctypes.c_double, 2 * num_joints + 10 + num_joints)
         self.ready, self.stop = SPAWN.Event(), SPAWN.Event()
 
     def _array(self) -> np.ndarray:

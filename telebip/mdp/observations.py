@@ -179,18 +179,23 @@ def model_value(
 ) -> Tensor:
     """A field of MuJoCo's model in each world, less the MJCF's value: what an event has drawn, for a critic, (num_envs, size).
 
+    Zeros where no event changes the field.
+
     Args:
         step: the present step.
-        field: as in `mujoco.MjModel`, one that an event changes.
+        field: as in `mujoco.MjModel`.
         names: of the bodies, joints, geoms, sites or actuators; all if not given.
         column: which number of each row, where it has several; all if not given.
         mirror: what it is, for `ppo.symmetry`; "none" if it has no mirror image.
 
     Raises:
-        UserError: no event changes the field.
+        UserError: there is no such field, or no part of such a name.
     """
-    if field not in step.world.sim.model_fields:
-        raise UserError(f"no event changes '{field}'; {nearest(field, step.world.sim.model_fields)}")
-    rows = rows_of(step.world, field, names)
+    world, model = step.world, step.world.sim.model
+    if not hasattr(model, field):
+        raise UserError(f"no field '{field}' in MuJoCo's model; {nearest(field, dir(model))}")
+    rows = rows_of(world, field, names)
     index = (slice(None), rows) if column is None else (slice(None), rows, column)
-    return (step.world.sim.model_fields[field][index] - step.world.nominal_fields[field][index[1:]]).flatten(1).float()
+    if field not in world.sim.model_fields:
+        return world.zeros(*getattr(model, field).shape)[index].flatten(1)
+    return (world.sim.model_fields[field][index] - world.nominal_fields[field][index[1:]]).flatten(1).float()

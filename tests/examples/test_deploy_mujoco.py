@@ -99,6 +99,89 @@ def test_another_robot_and_another_observation(deploy: SimpleNamespace, untraine
     assert np.abs(trajectory[-1, 7:] - expected[0, 7:]).max() > 0.01  # it does move
 
 
+QUIET = ("actions.jitter=[0,0]", "actions.loss=0", "observations.policy.loss=0", "observations.policy.noise=false")
+
+
+@pytest.fixture
+def real(tmp_path: Path) -> Path:
+    """A policy of telebip_real with random weights."""
+    task = load_task("telebip_real", ["num_envs=4"])
+    export(Trainer(telebip.make(task), "telebip_real", tmp_path).policy(), tmp_path / "real.onnx", samples=100)
+    return tmp_path / "real.onnx"
+
+
+@pytest.mark.parametrize("late", [0, 3, 8])
+def test_a_policy_for_a_real_robot_and_a_delay(deploy: SimpleNamespace, real: Path, robot: Robot, late: int) -> None:
+    task = load_task("telebip_real", ["num_envs=1", *QUIET, f"actions.physics_delay=[{late},{late}]", "episode.length=60"])
+    task = replace(task, events={"start_pose": {"joint_pos": 0.0, "heading": 1.0}})
+    env, command = TelebipEnv(task, robot, "cpu", "native"), np.array([0.6, 0.0, 0.1])
+    env.set_command(*command.tolist())
+    walker, obs = load_policy(load_checkpoint(real), "cpu"), env.get_observations()
+    expected = [env.sim.state.qpos[0].double().numpy()]
+    with torch.inference_mode():
+        for _ in range(20):
+            obs, *_ = env.step(walker(obs))
+            expected.append(env.sim.state.qpos[0].double().numpy())
+    policy = deploy.Policy(real)
+    simulated = deploy.SimulatedRobot(robot.path, policy.about, delay=0.005 * late)
+    simulated.data.qpos[:] = expected[0]
+    trajectory = deploy.walk(policy, simulated, command, 0.4)
+    np.testing.assert_allclose(trajectory, np.stack(expected[1:]), atol=2e-4)
+
+
+def test_what_a_robot_must_measure_is_told_and_checked(deploy: SimpleNamespace, real: Path, exported: Path) -> None:
+    policy = deploy.Policy(real)
+    measures = {part["name"]: part for part in policy.about["measures"]}
+    assert set(measures) == {"joint_pos", "joint_vel", "ang_vel", "quat"}  # no velocity of the base
+    assert measures["ang_vel"]["unit"] == "rad/s"
+    assert measures["ang_vel"]["frame"] == "of the trunk, in its frame"
+    assert measures["quat"]["for"] == ["projected_gravity", "heading hold"]
+    assert measures["joint_vel"]["noise"] == 0.2
+    assert (policy.about["history"], policy.about["action_delay"]) == (5, [0.0, 0.04])
+    policy.require({"joint_pos", "joint_vel", "ang_vel", "quat"})
+    line = r"the robot does not measure 'quat' \[w x y z, of the trunk in .*\], .* for: projected_gravity, heading hold$"
+    with pytest.raises(SystemExit, match=line):
+        policy.require({"joint_pos", "joint_vel", "ang_vel"})
+    with pytest.raises(SystemExit, match=r"the robot does not measure 'lin_vel' \[m/s, .*\], .* for: base_lin_vel$"):
+        deploy.Policy(exported).require({"joint_pos", "joint_vel", "ang_vel", "quat"})
+
+
+def test_a_model_with_names_and_limits_of_its_own(deploy: SimpleNamespace, tmp_path: Path, robot: Robot) -> None:
+    text = robot.path.read_text().replace('forcerange="-400 400"', 'forcerange="-300 60"')
+    (tmp_path / "own.xml").write_text(text)
+    task = load_task("telebip_real", ["num_envs=4", f"sim.robot={tmp_path / 'own.xml'}"])
+    export(Trainer(telebip.make(task), "own", tmp_path / "run").policy(), tmp_path / "own.onnx", samples=100)
+    policy = deploy.Policy(tmp_path / "own.onnx")
+    assert policy.about["force_range"][2] == [-300.0, 60.0]
+    for name, its_own in (("right_knee", "RK"), ("gyro", "imu_w"), ("orientation", "imu_q")):
+        text = text.replace(f'"{name}"', f'"{its_own}"')
+    (tmp_path / "other.xml").write_text(text)
+    names, sensors = {"right_knee": "RK"}, {"ang_vel": "imu_w", "quat": "imu_q"}
+    trajectories = []
+    for file, about in (("own.xml", ({}, {})), ("other.xml", (names, sensors))):
+        policy = deploy.Policy(tmp_path / "own.onnx")
+        simulated = deploy.SimulatedRobot(tmp_path / file, policy.about, *about)
+        trajectories.append(deploy.walk(policy, simulated, np.array([0.5, 0.0, 0.0]), 1.0))
+    np.testing.assert_allclose(*trajectories, atol=1e-6)
+    assert simulated.model.actuator_forcerange[2].tolist() == [-300.0, 60.0]
+
+
+@pytest.mark.parametrize(
+    ("names", "sensors", "line"),
+    [
+        ({"right_knee": "RK"}, {}, "no joint named 'RK', which the policy moves"),
+        ({}, {"quat": "imu"}, "no sensor named 'imu', which is to measure 'quat'"),
+        ({}, {"quat": "gyro"}, "sensor 'gyro' has 3 numbers, and 'quat' has 4"),
+        ({}, {"joint_pos": "gyro"}, "no sensor is needed for 'joint_pos'"),
+    ],
+)
+def test_names_that_are_not_there_are_one_line(
+    deploy: SimpleNamespace, exported: Path, robot: Robot, names: dict, sensors: dict, line: str
+) -> None:
+    with pytest.raises(SystemExit, match=line):
+        deploy.SimulatedRobot(robot.path, deploy.Policy(exported).about, names, sensors)
+
+
 def test_a_term_that_it_does_not_know_is_one_line(deploy: SimpleNamespace, untrained: Callable[..., Path]) -> None:
     file = untrained("four_joints", {"joint_pos": {"noise": 0.0}, "base_height": {"noise": 0.0}})
     with pytest.raises(SystemExit, match=r"policy.onnx: the policy sees 'base_height', which this example does not know"):
@@ -108,7 +191,9 @@ def test_a_term_that_it_does_not_know_is_one_line(deploy: SimpleNamespace, untra
 def test_its_command_line(
     exported: Path, robot: Robot, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sys, "argv", [EXAMPLE.name, str(exported), str(robot.path), "--duration", "4"])
+    monkeypatch.setattr(
+        sys, "argv", [EXAMPLE.name, str(exported), str(robot.path), "--duration", "4", "--sensor", "quat=orientation"]
+    )
     runpy.run_path(str(EXAMPLE), run_name="__main__")
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines[:2]] == ["2.0", "4.0"]

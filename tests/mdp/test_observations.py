@@ -9,7 +9,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from steps import CPU, again, make_step, make_world
+from steps import CPU, again, bind, make_step, make_world
 from torch import Tensor
 from worlds import MakeEnv, quat_mul
 
@@ -87,6 +87,7 @@ def test_observation_is_laid_out_in_this_order(robot: Robot) -> None:
         world=replace(make_world(robot), nominal=torch.tensor([0.5, 1.0, 1.5, 2.0, 2.5, 3.0])),
         state=state,
         last_action=row(31, 32, 33, 34, 35, 36),
+        joint_pos=state.joint_pos,
         base_lin_vel_b=row(41, 42, 43),
         base_ang_vel_b=state.base_ang_vel_b,
         heading_quat=row(61, 62, 63, 64),
@@ -307,3 +308,26 @@ def test_the_mirror_image_of_a_height_scan_swaps_right_and_left(robot: Robot) ->
 def test_heights_are_above_the_ground(robot: Robot) -> None:
     height = observations.base_height(on_a_slope(robot))
     torch.testing.assert_close(height, torch.full((2, 1), 0.7 - BELOW), atol=1e-4, rtol=0.0)
+
+
+def test_a_model_value_is_what_an_event_has_added_to_the_model_and_zero_where_none_does(robot: Robot) -> None:
+    step = make_step(robot, 3, fields=("body_ipos",))
+    trunk = robot.model.body("trunk").id
+    step.world.sim.model_fields["body_ipos"][:, trunk] += torch.tensor([[0.0, 0.0, 0.0], [0.01, 0.02, 0.03], [0.0, -0.01, 0.0]])
+    seen = bind(step, "observation", "model_value", field="body_ipos", names=["trunk"], column=None, mirror="polar")(step)
+    torch.testing.assert_close(
+        seen, torch.tensor([[0.0, 0.0, 0.0], [0.01, 0.02, 0.03], [0.0, -0.01, 0.0]]), atol=1e-6, rtol=0.0
+    )
+    one = bind(step, "observation", "model_value", field="body_ipos", names=["trunk"], column=1, mirror="same")(step)
+    assert one.shape == (3, 1) and one[1].item() == pytest.approx(0.02)
+    none = bind(step, "observation", "model_value", field="body_mass", names=["trunk"], column=None, mirror="same")(step)
+    assert torch.equal(none, torch.zeros(3, 1))
+    with pytest.raises(UserError, match=r"no field 'body_mas' in MuJoCo's model; did you mean 'body_mass'\?"):
+        bind(step, "observation", "model_value", field="body_mas", names=None, column=None, mirror="same")(step)
+
+
+def test_the_action_delay_is_told_in_seconds(robot: Robot) -> None:
+    step = make_step(robot, 2)
+    assert torch.equal(bind(step, "observation", "action_delay")(step), torch.zeros(2, 1))
+    step.env.memory["actions"] = {"delay": torch.tensor([0.0, 3.0])}
+    torch.testing.assert_close(bind(step, "observation", "action_delay")(step), torch.tensor([[0.0], [0.015]]))
