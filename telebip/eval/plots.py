@@ -235,7 +235,12 @@ def transfer(results: Results) -> Figure:
         axes.axvline(scale * factor["nominal"], color="#8b9099", lw=0.9, ls=":")
         shown = "ms" if unit == "physics steps" else unit
         axes.set(ylim=(-0.04, 1.04))
-        axes.set_title(factor["name"].replace("_", " ") + (f" [{shown}]" if shown else ""), fontsize=8, fontweight="normal")
+        axes.locator_params(axis="x", nbins=4)
+        axes.set_title(
+            factor["name"].removesuffix(".range").replace("_", " ") + (f" [{shown}]" if shown else ""),
+            fontsize=8,
+            fontweight="normal",
+        )
         axes.tick_params(labelsize=7)
     for axes in grid.flat[len(factors) :]:
         axes.set_visible(False)

@@ -62,7 +62,7 @@ def write_report(groups: Sequence[Group], out: Path, title: str, text: str = "",
 
 def summary(results: Results, width: int) -> str:
     """Return the tables of one walker for a terminal of `width` columns: a line for each number, a column for each row."""
-    tables = [table for table in _tables([[results]]) if table[2]]
+    tables = [table for table in _tables([[results]]) if table[2] and table[1][: len(WHO)] == [*WHO]]
     return "\n\n".join([str(results["label"]), *(_upright(*table, width) for table in tables)])
 
 
@@ -246,6 +246,7 @@ def _tables(groups: Sequence[Group]) -> list[Table]:
                 for rows in zip(*(part["worlds"] for part in parts), strict=True)
             ],
         ),
+        _factors_table([(group[0]["label"], parts[0]) for group, parts in _with("transfer", groups)]),
         ("Gait", gait, [[*_who(group), *_gait_cells(parts)] for group, parts in _with("gait", groups)]),
         ("Learning", learning, [[*_who(group), *_learning_cells(parts)] for group, parts in _with("learning", groups)]),
         (
@@ -254,6 +255,20 @@ def _tables(groups: Sequence[Group]) -> list[Table]:
             [[*_who(group), *_machine_cells(group)] for group in groups if "engine" in group[0]],
         ),
     ]
+
+
+def _factors_table(measured: Sequence[tuple[str, Any]]) -> Table:
+    """Return what each factor does at worst over its range: a row for each, a column for each walker, its first seed."""
+    swept = [(label, {factor["name"]: factor["points"] for factor in part["factors"]}) for label, part in measured]
+    names = list(dict.fromkeys(name for _, factors in swept for name in factors))
+
+    def worst(points: Sequence[dict[str, Any]]) -> str:
+        error = max((row["speed_error"] for row in points if row["speed_error"] is not None), default=math.nan)
+        falls = max(points, key=lambda row: row["falls"] / row["worlds"])
+        return f"{falls['falls']} of {falls['worlds']} / {number(100.0 * error, 1)} %"
+
+    rows = [[name, *(worst(factors[name]) if name in factors else "-" for _, factors in swept)] for name in names]
+    return "Transfer: most falls and largest median speed error over the range of one factor", ["factor", *dict(swept)], rows
 
 
 def _summary(groups: Sequence[Group]) -> list[Table]:
