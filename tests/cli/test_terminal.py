@@ -39,8 +39,8 @@ def test_the_summary_of_a_measurement_fits_the_terminal(width: int) -> None:
     assert max(map(len, lines)) <= width
     (speeds, *_) = [line.split()[3:] for line in lines if line.startswith("  mean speed [m/s]")]
     assert speeds[:3] == [f"{RESULTS['tracking'][0]['mean_speed_mps']:.3f}", "±", f"{RESULTS['tracking'][0]['ci95_mps']:.3f}"]
-    (pushes, *_) = [line.split() for line in lines if line.startswith("  forward [N]")]
-    assert pushes[-1] == f"{RESULTS['push']['10s']['forward_n']:.0f}"
+    (regularity,) = [line.split()[1:] for line in lines if line.startswith("  regularity")]
+    assert regularity == [f"{RESULTS['gait']['regularity']:.3f}"]
 
 
 def test_what_play_measures_fits_60_columns(capsys: pytest.CaptureFixture[str]) -> None:
