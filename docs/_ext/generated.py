@@ -14,7 +14,8 @@ from typing import Any, Literal, get_args, get_origin
 
 from sphinx.application import Sphinx
 
-import telebip.mdp.terms  # noqa: F401 (enters telebip's terms)
+import telebip.mdp.term
+import telebip.mdp.terms  # (enters telebip's terms)
 from telebip import ROOT
 from telebip.config import task_names
 from telebip.config.schema import TaskConfig
@@ -55,8 +56,9 @@ def _section(name: str, schema: Any, entry: Entry) -> str:
 
 def _group() -> str:
     """Return the fields of a group of observations, beside its terms."""
+    said = _comments(ObservationGroup)
     rows = [
-        _row(f"observations.<group>.{f.name}", Parameter.of(f.type, f.default))
+        _row(f"observations.<group>.{f.name}", Parameter.of(f.type, f.default), said=said[f.name])
         for f in fields(ObservationGroup)
         if f.name != "terms"
     ]
@@ -70,20 +72,29 @@ def terms(kind: Kind) -> str:
 
 
 def observations() -> str:
-    """Return a table of all observations, and the parameters of those that have some of their own."""
+    """Return what every observation may have, a table of all, and the parameters of those that have some of their own."""
+    own = [term for term in TERMS["observation"].values() if term.function.__module__.startswith("telebip.")]
+    said = dict(re.findall(r'^ +"(\w+)": Parameter\(.+\),  # (.+)$', inspect.getsource(telebip.mdp.term), re.MULTILINE))
+    plain = next(term for term in own if not term.own_parameters)
+    common = [_row(name, parameter, said=said[name]) for name, parameter in plain.parameters.items()]
     rows = []
-    for term in (term for term in TERMS["observation"].values() if term.function.__module__.startswith("telebip.")):
-        noise, said = _in_base(term), " ".join(_docstring(term.function)[0].split("\n\n")[0].split())
-        value = _shown(noise["noise"]) if "noise" in noise else "0" if term.name in OBSERVED else ""
-        rows.append(f"| `{term.name}` | {value} | {_cell(term.unit)} | {_cell(said)} |")
+    for term in own:
+        noise, text = _in_base(term).get("noise"), " ".join(_docstring(term.function)[0].split("\n\n")[0].split())
+        value = _shown(noise) if noise else "0" if term.name in OBSERVED else ""
+        rows.append(f"| `{term.name}` | {value} | {_cell(term.unit)} | {_cell(text)} |")
     table = ["| observation | noise in `telebip_flat` | unit | what it is |", "|---|---|---|---|", *rows]
-    return "\n".join([*table, *(_term(term) for term in TERMS["observation"].values() if term.own_parameters)])
+    return "\n".join([*_table("parameter", common), "", *table, *(_term(term) for term in own if term.own_parameters)])
 
 
 def attributes(owner: type) -> str:
     """Return a table of a dataclass's fields, with the comments that stand beside them."""
-    found = re.findall(r"^    (\w+): [^#\n]+  # (.+)$", inspect.getsource(owner), re.MULTILINE)
-    return "\n".join(["| field | what it is |", "|---|---|", *(f"| `{name}` | {_cell(said)} |" for name, said in found)])
+    rows = (f"| `{name}` | {_cell(said)} |" for name, said in _comments(owner).items())
+    return "\n".join(["| field | what it is |", "|---|---|", *rows])
+
+
+def _comments(owner: type) -> dict[str, str]:
+    """Return the comments that stand beside the fields of a dataclass."""
+    return dict(re.findall(r"^    (\w+): [^#\n]+  # (.+)$", inspect.getsource(owner), re.MULTILINE))
 
 
 def _term(term: Term) -> str:
