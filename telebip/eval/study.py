@@ -32,6 +32,7 @@ TRAININGS = (
     Training("telebip_efficient", "RL, efficient", ALL),
     Training("telebip_robust", "RL, robust", ALL),
     Training("telebip_flat", "RL, article's rewards", ALL),
+    Training("telebip_rotary", "RL, rotary knees", ALL),
     Training("efficient_float32", "RL, efficient, float32"),
     Training("telebip_slow", "RL, slow"),
     Training("telebip_fast", "RL, fast"),
@@ -45,6 +46,7 @@ TRAININGS = (
     Training("telebip_rough", "RL, rough ground", ("tracking", "gait", "learning", "terrain")),
     Training("telebip_stairs", "RL, stairs", ("tracking", "gait", "learning", "terrain")),
     Training("telebip_omni", "RL, all directions", ("tracking", "gait", "learning", "omni")),
+    Training("telebip_real", "RL, for a real robot", ("tracking", "gait", "learning", "transfer")),
 )
 
 BASELINES = (Baseline("alip", "angular momentum", "alip"), Baseline("dcm", "DCM", "dcm"))

@@ -11,7 +11,7 @@ from telebip.cli import play
 from telebip.cli.evaluate import progress_bar
 from telebip.eval.report import summary
 
-RESULTS = json.loads((ROOT / "docs" / "results" / "telebip_efficient" / "results.json").read_text(encoding="utf-8"))
+RESULTS = json.loads((ROOT / "docs" / "results" / "telebip_efficient" / "seed1" / "results.json").read_text(encoding="utf-8"))
 WIDTHS = (60, 80, 120, 200)
 
 
