@@ -390,7 +390,11 @@ def _energy_table(groups: Sequence[Group]) -> Table:
         shares += [over_seeds([_share(part, phase=phase) for part in parts], 3) for phase in PHASES]
         shares += [over_seeds([sum(entry[sign] for entry in part) for part in parts], 3) for sign in ("positive", "negative")]
         cells.append([*_who(group), *shares])
-    return "Where the energy goes: cost of transport at the speed nearest to 0.7 m/s, by joint, by phase of its leg, by sign", header, cells
+    return (
+        "Where the energy goes: cost of transport at the speed nearest to 0.7 m/s, by joint, by phase of its leg, by sign",
+        header,
+        cells,
+    )
 
 
 def _nearest_rows(group: Group) -> list[dict[str, Any]]:
