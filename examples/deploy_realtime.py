@@ -61,7 +61,7 @@ class Shared:
         self.ready, self.stop = SPAWN.Event(), SPAWN.Event()
 
     def _array(self) -> np.ndarray:
-        return np.frombuffer(self._numbers, dtype=np.float64)
+        return np.ctypeslib.as_array(self._numbers)
 
     def tell_readings(self, readings: Readings) -> None:
         """Write what the sensors say."""

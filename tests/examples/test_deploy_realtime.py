@@ -1,3 +1,4 @@
+# pyright: reportAttributeAccessIssue=false, reportMissingImports=false
 """The example with a policy in a process of its own: its filter, its loops, and that a robot walks by it."""
 
 import re

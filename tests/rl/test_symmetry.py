@@ -9,9 +9,11 @@ from tensordict import TensorDict
 from torch import Tensor
 from worlds import MakeEnv, random_actions
 
+from telebip.config import load_task
 from telebip.env import TelebipEnv
 from telebip.errors import UserError
 from telebip.rl.symmetry import Canonical, SymmetricEnv, SymmetricPolicy, joint_mirror
+from telebip.robot import Robot
 
 PHASE_RIGHT, HISTORY = 31, ("observations.policy.history=3",)
 """Column of p_r in the newest frame."""
@@ -108,3 +110,17 @@ def test_a_group_that_nobody_learns_from_needs_no_mirror_image(make_env: MakeEnv
     env = make_env(estimate=True)
     env.groups["estimate"].parts[:] = [replace(part, image="it has none") for part in env.groups["estimate"].parts]
     assert set(SymmetricEnv(env).get_observations().keys()) == {"policy"}
+
+
+def test_policy_and_critic_of_a_real_robot_have_a_mirror_image(robot: Robot) -> None:
+    """Of the critic's frame, the trunk's centre of mass is a vector, and mass, friction and delay are the same."""
+    env = TelebipEnv(load_task("telebip_real", ["num_envs=16"]), robot, "cpu", "native")
+    canonical, obs = canonical_of(env), env.get_observations()
+    for name, group in canonical.groups.items():
+        assert torch.equal(group(group(obs[name])), obs[name])
+        assert not torch.equal(group(obs[name]), obs[name])
+    friction, delay, mass, com = canonical.groups["critic"](obs["critic"])[:, -6:].split([1, 1, 1, 3], dim=1)
+    assert torch.equal(torch.cat([friction, delay, mass], dim=1), obs["critic"][:, -6:-3])
+    torch.testing.assert_close(com, obs["critic"][:, -3:] * torch.tensor([1.0, -1.0, 1.0]))
+    assert com.abs().amax(0).min() > 0.01
+    assert len(mass.unique()) == 16
