@@ -35,8 +35,9 @@ def as_evaluated(
 ) -> TaskConfig:
     """Return a task whose robots start facing x and walk `duration` s without a time-out.
 
-    `disturbed` ones keep the task's disturbances; else there is no observation noise, and no event that is a disturbance, such
-    as pushes and random friction, but those that `overrides` name. The group of observations `critic` is left out.
+    `disturbed` ones keep the task's disturbances; else there is no observation noise, nothing gets lost and delays have no
+    jitter, and there is no event that is a disturbance, such as pushes and random friction, but those that `overrides` name.
+    Delays remain. The group of observations `critic` is left out.
     """
     load_task(config, overrides)  # so that a mistake in them is told beside the whole task's names
     named = {override.partition("=")[0].split(".")[1] for override in overrides if override.startswith("events.")}
@@ -46,9 +47,11 @@ def as_evaluated(
         if disturbed or name in named or not event.is_disturbance:
             events[name] = {**params, "heading": 0.0} if event.name == "start_pose" else params
     groups = {
-        name: group if disturbed else replace(group, noise=False)
+        name: group if disturbed else replace(group, noise=False, loss=0.0)
         for name, group in config.observations.items()
         if name != "critic"
     }
     episode = replace(config.episode, length=duration + 1.0)
-    return load_task(replace(config, num_envs=num_envs, episode=episode, events=events, observations=groups), overrides)
+    actions = config.actions if disturbed else replace(config.actions, jitter=(0, 0), loss=0.0)
+    parts = {"episode": episode, "events": events, "observations": groups, "actions": actions}
+    return load_task(replace(config, num_envs=num_envs, **parts), overrides)

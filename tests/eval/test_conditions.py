@@ -45,3 +45,11 @@ def test_walking_needs_no_critic() -> None:
     task = load_task("telebip_flat", ["observations.critic={joint_pos: {}, foot_force: {}}"])
     assert [*task.observations] == ["policy", "critic"]
     assert [*as_evaluated(task, 1, 2.0).observations] == ["policy"]
+
+
+@pytest.mark.parametrize("disturbed", [False, True])
+def test_nothing_gets_lost_where_nothing_disturbs_and_delays_remain(disturbed: bool) -> None:
+    task = as_evaluated(load_task("telebip_real"), 1, 1.0, disturbed=disturbed)
+    assert task.observations["policy"].loss == task.actions.loss == (0.02 if disturbed else 0.0)
+    assert task.actions.jitter == ((0, 2) if disturbed else (0, 0))
+    assert task.actions.physics_delay == (0, 6)
