@@ -95,7 +95,7 @@ def write_tables(page: Path, groups: Sequence[Group], references: Sequence[Resul
     if not (begin and end):
         raise UserError(f"'{page}' lacks the lines '{BEGIN}' and '{END}', between which the tables are written")
     every = [*groups, *([results] for results in references)]
-    tables = [f"### {heading}\n\n{_markdown(header, rows)}" for heading, header, rows in _summary(every) if rows]
+    tables = [f"## {heading}\n\n{_markdown(header, rows)}" for heading, header, rows in _summary(every) if rows]
     write(page, "\n\n".join([before + begin, *tables, end + after]))
 
 
