@@ -31,7 +31,7 @@ EXACT = {"noise": 0.0, "delay": (0, 0)}
 """What an observation is if nothing is said of it."""
 CHILDREN = (
     *("telebip_backward", "telebip_efficient", "telebip_fast", "telebip_omni", "telebip_quick", "telebip_robust"),
-    *("telebip_real", "telebip_rotary", "telebip_rough", "telebip_seeing", "telebip_slow", "telebip_stairs"),
+    *("telebip_real", "telebip_rotary", "telebip_rough", "telebip_slow", "telebip_stairs"),
 )
 
 
