@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from telebip.errors import UserError
 from telebip.eval import plots
 from telebip.eval.energy import PHASES
+from telebip.eval.push import DIRECTIONS
 from telebip.eval.statistics import estimate, share_interval
 from telebip.eval.study import median_seed
 from telebip.eval.suites import SCHEMA
@@ -200,7 +201,7 @@ def _tables(groups: Sequence[Group]) -> list[Table]:
     tracking = [*WHO, "command [m/s]", "mean speed [m/s]", "error", "RMS error [m/s]", "falls", "yaw drift [deg]"]
     tracking += ["COT mechanical", "COT article", "COT positive"]
     push = [*WHO, *(f"all: {name} [N]" for name in directions), *(f"95 %: {name} [N]" for name in directions)]
-    push += ["share at that limit, with its interval", "all: as impulse [N s]", "all: of body weight"]
+    push += [*(f"share at that limit, {name}" for name in DIRECTIONS), "all: as impulse [N s]", "all: of body weight"]
     gait = [*WHO, "command [m/s]", "period [s]", "regularity", "symmetry", "duty factor", "double support", "flight"]
     gait += ["peak force [body weights]", "stride [m]", "knee stroke [m]"]
     learning = [*WHO, "samples", "to 95 % of the final episode length", "to 95 % of the final return"]
@@ -369,11 +370,11 @@ def _tracking_cells(rows: Sequence[dict[str, Any]]) -> list[str]:
 
 def _push_cells(parts: Sequence[dict[str, Any]]) -> list[str]:
     names = ("forward", "backward", "lateral")
-    shares = [share for share in parts[0].get("shares", {}).values() if share] if len(parts) == 1 else []
+    shares = [(parts[0].get("shares") or {}).get(name) if len(parts) == 1 else None for name in DIRECTIONS]
     return [
         *(over_seeds([part[f"{name}_n"] for part in parts], 0) for name in names),
         *(over_seeds([part.get(f"{name}_95_n") for part in parts], 0) for name in names),
-        " / ".join(f"{s['share']:.3f} [{s['share_low']:.3f}, {s['share_high']:.3f}]" for s in shares) or "-",
+        *(f"{s['share']:.3f} [{s['share_low']:.3f}, {s['share_high']:.3f}]" if s else "-" for s in shares),
         " / ".join(over_seeds([part.get(f"{name}_ns") for part in parts], 1) for name in names),
         " / ".join(over_seeds([part.get(f"{name}_bw") for part in parts], 2) for name in names),
     ]
@@ -391,7 +392,7 @@ def _energy_table(groups: Sequence[Group]) -> Table:
         shares += [over_seeds([sum(entry[sign] for entry in part) for part in parts], 3) for sign in ("positive", "negative")]
         cells.append([*_who(group), *shares])
     return (
-        "Where the energy goes: cost of transport at the speed nearest to 0.7 m/s, by joint, by phase of its leg, by sign",
+        "Where the energy goes: shares of the cost at about 0.7 m/s",
         header,
         cells,
     )

@@ -274,7 +274,7 @@ def test_a_whole_field_has_a_number_for_each_row(robot: Robot) -> None:
 def test_names_and_rows_that_there_are_not(robot: Robot) -> None:
     step = make_step(robot, fields=FIELDS)
     with pytest.raises(UserError, match=r"no body named 'trunc' .*valid: .*'trunk'"):
-        bind(step, "event", "mass", scale=(0.9, 1.1), bodies=["trunc"])(step, everywhere(step))
+        bind(step, "event", "mass", scale=(0.9, 1.1), inertia=(1.0, 1.0), bodies=["trunc"])(step, everywhere(step))
     with pytest.raises(UserError, match="rows of field 'opt_gravity' have no names; leave out `names`"):
         params = {"field": "opt_gravity", "range": (0.9, 1.1), "operation": "scale", "names": ["x"], "column": None}
         bind(step, "event", "model_field", **params)
@@ -334,7 +334,7 @@ def test_when_an_event_happens_is_the_task_s_choice(robot: Robot) -> None:
     binder = Binder(step)
     entries = {
         "friction": {"range": (0.5, 1.1), "when": "reset"},
-        "mass": {"scale": (0.9, 1.1), "bodies": None, "when": "once"},
+        "mass": {"scale": (0.9, 1.1), "inertia": (1.0, 1.0), "bodies": None, "when": "once"},
     }
     events = Events(entries, binder)
     binder.allocate().draw(torch.Generator().manual_seed(0))
