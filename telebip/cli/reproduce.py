@@ -30,7 +30,7 @@ EXAMPLES = """\
 
 QUICK_TRAINING = ("num_envs=64", "ppo.max_iterations=2", "ppo.hidden_dims=[32,32]")
 SHIPPED = Path("assets/policies")  # of telebip's own folder
-WORLD_STEPS = {"tracking": 0.2e6, "push": 5.0e6, "terrain": 2.9e6, "omni": 3.5e6}
+WORLD_STEPS = {"tracking": 0.2e6, "push": 5.0e6, "terrain": 2.9e6, "omni": 3.5e6, "transfer": 11.0e6}
 """About how much each suite simulates; half as much work as in training, where the policy learns too."""
 INTRODUCTION = (
     "Reinforcement learning and two model-based walkers on one robot, measured by one evaluator; in grey, and in the last "
@@ -150,6 +150,7 @@ def _protocol(options: argparse.Namespace) -> "Protocol":
     from telebip.eval.push import PushProtocol
     from telebip.eval.suites import Protocol
     from telebip.eval.terrain import TerrainProtocol
+    from telebip.eval.transfer import TransferProtocol
 
     device = resolve_device(options.device)
     if not options.quick:
@@ -158,7 +159,9 @@ def _protocol(options: argparse.Namespace) -> "Protocol":
     omni = OmniProtocol(
         (0.5,), (0.0,), (0.0,), (0.5,), directions=1, changes=1, worlds=1, duration=1.0, change_at=0.2, skip=0.2
     )
-    return Protocol(4, 3.0, 1.0, push=push, omni=omni, terrain=TerrainProtocol(worlds=1, command=2.0), device=device)
+    terrain = TerrainProtocol(worlds=1, command=2.0)
+    transfer = TransferProtocol(worlds=2, points=0, duration=1.0, skip=0.2)
+    return Protocol(4, 3.0, 1.0, push=push, omni=omni, terrain=terrain, transfer=transfer, device=device)
 
 
 def _is_current(file: Path, candidate: "Candidate", suites: Sequence[str], protocol: "Protocol") -> bool:
