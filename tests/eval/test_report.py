@@ -7,8 +7,9 @@ import pytest
 
 from telebip.errors import UserError
 from telebip.eval import plots
-from telebip.eval.report import BEGIN, END, over_seeds, write_tables
+from telebip.eval.report import BEGIN, END, write_tables
 from telebip.eval.study import mean_cost, median_seed
+from telebip.eval.tables import over_seeds
 
 
 def found(seed: int, *costs: float | None, falls: int = 0) -> dict[str, Any]:
