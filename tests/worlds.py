@@ -33,7 +33,7 @@ MORE_EVENTFUL = (
     *EVENTFUL,
     "observations.critic={joint_pos: {noise: 0.01}, foot_force: {}, friction: {}, push_force: {}, delay: [1, 1], history: 2}",
     *("observations.policy.history=3", "observations.policy.delay=[0,2]", "actions.delay=[0,2]", "actions.physics_delay=[0,3]"),
-    *("rewards.energy.ramp=[0,1000]", "events.push.ramp=[10,500]"),
+    *("rewards.energy.ramp=[0,1000]", "rewards.cot={k_cot: -1, min_speed: 0.3, ramp: [0, 1000]}", "events.push.ramp=[10,500]"),
     *("events.kick={lin_vel: 0.3, ang_vel: 1.0, interval: [0.06, 0.12]}", "events.mass={scale: [0.8, 1.2]}"),
 )
 """The same with what a task may have: a critic's group, histories, delays, kicks and masses."""

@@ -157,6 +157,32 @@ def energy(step: Step, *, k_energy: Annotated[float, Quantity("s/m", le=0)], ram
 
 
 @reward
+def cot(
+    step: Step,
+    *,
+    k_cot: Annotated[float, Quantity(le=0)],
+    min_speed: Annotated[float, Quantity("m/s", gt=0)],
+    ramp: Ramp,
+) -> Tensor:
+    r"""Penalty on the cost of transport: r_cot = k_cot sum_i |tau_i qd_i| / (m g max(||v_xy_cmd||, min_speed)).
+
+    Not in the article. `energy` prices a second of walking, this a metre, so that slow walking is priced as high as fast
+    walking is. The speed is the commanded one: with its own the robot could walk faster than it is told, and be paid for it.
+
+    Args:
+        step: its command, and the power of the joints.
+        k_cot: reward at a cost of transport of 1 [-].
+        min_speed: commanded speed below which the price is that of a second [m/s].
+        ramp: samples between which the term grows from nothing to all of it.
+
+    Returns:
+        Reward [-], (num_envs,).
+    """
+    cost = step.state.joint_power.sum(1) / (step.world.weight * norm(step.command[:, :2]).clamp(min=min_speed))
+    return progress(step.env.samples, ramp) * k_cot * cost
+
+
+@reward
 def termination(step: Step, *, k_termination: Annotated[float, Quantity(le=0)]) -> Tensor:
     r"""Penalty on a fall: r_T = k_T where the episode ends by a termination (-1 in the article), else 0, (num_envs,) [-].
 

@@ -130,6 +130,16 @@ def test_energy_is_the_power_in_body_weights_times_its_share(samples: float, sha
     torch.testing.assert_close(reward, torch.tensor([share * -0.3 * 0.4, 0.0]))
 
 
+@pytest.mark.parametrize(("samples", "share"), [(0.0, 0.0), (2000.0, 0.5), (math.inf, 1.0)])
+def test_cost_of_transport_is_the_power_in_body_weights_over_the_commanded_speed(samples: float, share: float) -> None:
+    state = SimpleNamespace(joint_power=torch.tensor([[1.0, 2.0, 27.0, 0.0, 0.0, 10.0]] * 3))
+    env, world = SimpleNamespace(samples=torch.tensor(samples)), SimpleNamespace(weight=100.0)
+    command = torch.tensor([[0.5, 0.0, 0.9], [-0.3, 0.4, 0.0], [0.1, 0.0, 0.9]])  # the last is slower than min_speed
+    step: Any = SimpleNamespace(state=state, env=env, world=world, command=command)
+    reward = rewards.cot(step, k_cot=-1.5, min_speed=0.2, ramp=(1000.0, 3000.0))
+    torch.testing.assert_close(reward, share * -1.5 * torch.tensor([0.8, 0.8, 2.0]))
+
+
 def test_only_a_fall_costs() -> None:
     step: Any = SimpleNamespace(fallen=torch.tensor([True, False]))
     torch.testing.assert_close(rewards.termination(step, k_termination=-1.0), torch.tensor([-1.0, 0.0]))
@@ -169,8 +179,9 @@ def test_the_published_task_gives_the_modules_of_the_article_and_the_energy_term
     assert values == pytest.approx(article | {"energy": 0.5 * -0.3 * 0.4}, rel=1e-5)
 
 
-def test_the_published_task_names_every_reward_but_the_mean_over_a_stride() -> None:
-    own = {name for name, term in TERMS["reward"].items() if term.function.__module__ == rewards.__name__} - {"stride_cmd"}
+def test_the_published_task_names_every_reward_but_two_of_ours() -> None:
+    own = {name for name, term in TERMS["reward"].items() if term.function.__module__ == rewards.__name__}
+    own -= {"stride_cmd", "cot"}
     assert set(TASK.rewards) == own
     assert {name: set(params) for name, params in TASK.rewards.items()} == {
         name: set(TERMS["reward"][name].parameters) for name in own
