@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from telebip import ROOT
 from telebip.cli.common import Parser, resolve_device
 from telebip.cli.evaluate import checkpoint_candidate, controller_candidate, measure, references
 from telebip.cli.trainings import Run, default_jobs, train_all
@@ -206,21 +207,42 @@ def _ship(console: "Console", training: "Training", runs: dict[tuple[str, int], 
 
 
 def _report(console: "Console", options: argparse.Namespace) -> None:
-    """Write the report about all results that are there."""
-    from telebip.eval.report import write_report, write_tables
-    from telebip.eval.study import BASELINES, TRAININGS
+    """Write the report about all results that are there, and the tables of the pages that show them."""
+    from telebip.eval.report import write_report
 
     out = Path(options.out)
-    groups = [_seeds(out / training.name, options.shipped) for training in TRAININGS]
-    groups += [[_read(file)] for baseline in BASELINES if (file := out / baseline.name / "results.json").is_file()]
-    groups = [group for group in groups if group]
-    write_report(groups, out, "The study", INTRODUCTION, references())
-    written = f"wrote {out}/report.md and report.html, about {len(groups)} walkers"
-    page = out.with_suffix(".md")
-    if page.is_file():
-        write_tables(page, groups, references())
-        written += f", and the tables of {page}"
-    console.print(written)
+    walkers = _walkers(out, options.shipped)
+    write_report(list(walkers.values()), out, "The study", INTRODUCTION, references())
+    console.print(f"wrote {out}/report.md and report.html, about {len(walkers)} walkers")
+    for page in _write_pages(walkers, options):
+        console.print(f"wrote the tables of {page}")
+
+
+def _write_pages(walkers: dict[str, list[dict[str, Any]]], options: argparse.Namespace) -> list[Path]:
+    """Write the tables of the page beside the results, and of README for the study's own; return the pages there are."""
+    from telebip.eval.report import write_tables
+    from telebip.eval.study import IN_README
+    from telebip.eval.tables import overview, short_overview
+
+    out = Path(options.out)
+    every = [*walkers.values(), *([results] for results in references())]
+    pages = {out.with_suffix(".md"): overview(every)}
+    if not options.quick and out.resolve() == ROOT / "docs" / "results":
+        pages[ROOT / "README.md"] = [short_overview({name: walkers[name] for name in IN_README if name in walkers})]
+    there = [page for page in pages if page.is_file()]  # an installed package has none
+    for page in there:
+        write_tables(page, pages[page])
+    return there
+
+
+def _walkers(out: Path, is_shipped: bool) -> dict[str, list[dict[str, Any]]]:
+    """Return the results of every walker that has some, by its name."""
+    from telebip.eval.study import BASELINES, TRAININGS
+
+    walkers = {training.name: _seeds(out / training.name, is_shipped) for training in TRAININGS}
+    files = {baseline.name: out / baseline.name / "results.json" for baseline in BASELINES}
+    walkers |= {name: [_read(file)] for name, file in files.items() if file.is_file()}
+    return {name: group for name, group in walkers.items() if group}
 
 
 def _seeds(folder: Path, is_shipped: bool) -> list[dict[str, Any]]:

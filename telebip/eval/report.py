@@ -14,7 +14,7 @@ from telebip.errors import UserError
 from telebip.eval import plots
 from telebip.eval.study import median_seed
 from telebip.eval.suites import SCHEMA
-from telebip.eval.tables import WHO, Group, Results, overview, tables
+from telebip.eval.tables import WHO, Group, Results, Table, overview, tables
 
 BEGIN = "<!-- written by scripts/reproduce.py from here -->"
 END = "<!-- to here -->"
@@ -74,8 +74,8 @@ def _upright(heading: str, header: list[str], rows: list[list[str]], width: int)
     return "\n".join([heading, "\n\n".join(lines)])
 
 
-def write_tables(page: Path, groups: Sequence[Group], references: Sequence[Results] = ()) -> None:
-    """Replace what stands between the markers of a Markdown page by the summary of `groups`.
+def write_tables(page: Path, tables: Sequence[Table]) -> None:
+    """Replace what stands between the markers of a Markdown page by tables; one without a title has no heading.
 
     Raises:
         UserError: the page cannot be read or written, or lacks the markers.
@@ -88,8 +88,8 @@ def write_tables(page: Path, groups: Sequence[Group], references: Sequence[Resul
     _, end, after = rest.partition(END)
     if not (begin and end):
         raise UserError(f"'{page}' lacks the lines '{BEGIN}' and '{END}', between which the tables are written")
-    every = [*groups, *([results] for results in references)]
-    parts = [f"## {heading}\n\n{_markdown(header, rows)}" for heading, header, rows in overview(every) if rows]
+    filled = [table for table in tables if table[2]]
+    parts = [(f"## {heading}\n\n" if heading else "") + _markdown(header, rows) for heading, header, rows in filled]
     write(page, "\n\n".join([before + begin, *parts, end + after]))
 
 

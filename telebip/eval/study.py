@@ -51,6 +51,8 @@ TRAININGS = (
 
 BASELINES = (Baseline("alip", "angular momentum", "alip"), Baseline("dcm", "DCM", "dcm"))
 
+IN_README = ("telebip_efficient", "telebip_robust", "telebip_flat", "alip", "dcm")
+
 
 def median_seed(results: Mapping[int, Mapping[str, Any]]) -> int:
     """Return which of a policy's seeds is shipped: the median of the mean cost of transport, of the seeds without a fall.

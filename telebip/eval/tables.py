@@ -1,7 +1,7 @@
 """The numbers of a report: tables of walkers, with interquartile means and intervals where a walker has several seeds."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from telebip.eval.energy import PHASES
@@ -111,6 +111,18 @@ def overview(groups: Sequence[Group]) -> list[Table]:
             ],
         ),
     ]
+
+
+def short_overview(walkers: Mapping[str, Group]) -> Table:
+    """Return the table of the README: walkers by name, at 0.7 m/s, and the pushes that all worlds survive for 10 s."""
+    header = [*WHO, "cost of transport", "largest speed error", "falls", *(f"push {name} [N]" for name in SIDES)]
+    rows = []
+    for name, group in walkers.items():
+        tracked = [results["tracking"] for results in group if results.get("tracking")]
+        pushed = [part["10s"] for results in group if "10s" in (part := results.get("push") or {})]
+        limits = (over_seeds([part[f"{side}_n"] for part in pushed], 0) for side in SIDES)
+        rows.append([f"`{name}`", _who(group)[1], *_walking_cells(tracked, [0.7]), *limits])
+    return "", header, rows
 
 
 def _walking_cells(parts: Sequence[list[dict[str, Any]]], commands: Sequence[float]) -> list[str]:

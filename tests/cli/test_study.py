@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import sys
 from functools import partial
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 from processes import fresh
 from test_commands_line import ran, refusal
 
+from telebip import ROOT
 from telebip.cli import evaluate, reproduce
 from telebip.cli.console import Console
 from telebip.eval.report import BEGIN, END
@@ -138,6 +140,27 @@ def test_results_that_lack_something_are_measured_again_or_named(tmp_path: Path)
     assert "dcm: measured already" in ran(REPRODUCE, *where)
     files["dcm"].write_text("{")
     assert "dcm: measured\n" in ran(REPRODUCE, *where)
+
+
+def text_apart_from_intervals(page: Path) -> str:
+    return re.sub(r" \[-?[\d.]+, -?[\d.]+\]", "", page.read_text())
+
+
+def test_readme_and_results_show_what_was_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    walkers, pages = reproduce._walkers(ROOT / "docs" / "results", is_shipped=False), ("README.md", "docs/results.md")
+    (tmp_path / "docs").mkdir()
+    for page in pages:
+        before, _, rest = (ROOT / page).read_text().partition(BEGIN)
+        (tmp_path / page).write_text(f"{before}{BEGIN}\nold\n{END}{rest.partition(END)[2]}")
+    monkeypatch.setattr(reproduce, "ROOT", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    quick, elsewhere, real = (["--quick", "--out", "docs/results"], ["--out", "elsewhere"], [])
+    written = [reproduce._write_pages(walkers, reproduce._parse(options)) for options in (quick, elsewhere, real)]
+    assert written == [[Path("docs/results.md")], [], [Path("docs/results.md"), tmp_path / "README.md"]]
+    for page in pages:
+        assert text_apart_from_intervals(tmp_path / page) == text_apart_from_intervals(ROOT / page)
+    (tmp_path / "README.md").unlink()  # as in an installed package
+    assert reproduce._write_pages(walkers, reproduce._parse([])) == [Path("docs/results.md")]
 
 
 def test_the_toy_study_keeps_apart_from_the_real_one() -> None:

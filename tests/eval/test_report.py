@@ -9,7 +9,7 @@ from telebip.errors import UserError
 from telebip.eval import plots
 from telebip.eval.report import BEGIN, END, write_tables
 from telebip.eval.study import mean_cost, median_seed
-from telebip.eval.tables import over_seeds
+from telebip.eval.tables import over_seeds, overview, short_overview
 
 
 def found(seed: int, *costs: float | None, falls: int = 0) -> dict[str, Any]:
@@ -43,7 +43,7 @@ def test_tables_are_written_between_the_markers_again_and_again(tmp_path: Path) 
     group = [found(seed, 0.1 * seed) for seed in (1, 2, 3, 4, 5)]
     texts = []
     for _ in range(2):
-        write_tables(page, [group])
+        write_tables(page, overview([group]))
         texts.append(page.read_text())
     assert texts[0] == texts[1]
     assert "| RL | 5 seeds | 0.300 [" in texts[0]
@@ -51,7 +51,21 @@ def test_tables_are_written_between_the_markers_again_and_again(tmp_path: Path) 
     assert texts[0].endswith("What to make of it.\n")
     page.write_text("no markers")
     with pytest.raises(UserError, match="lacks the lines"):
-        write_tables(page, [group])
+        write_tables(page, overview([group]))
+
+
+def test_the_table_of_the_readme_has_no_heading_and_a_dash_for_what_is_not_measured(tmp_path: Path) -> None:
+    page = tmp_path / "README.md"
+    page.write_text(f"{BEGIN}\n{END}\n")
+    pushed = {"push": {"10s": {"forward_n": 100.0, "backward_n": 90.0, "lateral_n": 40.0}}}
+    walkers = {"three": [{**found(seed, 0.1, 0.1 * seed), **pushed} for seed in (1, 2, 3)], "one": [found(1, 0.3, falls=2)]}
+    write_tables(page, [short_overview(walkers)])
+    header, _, three, one = (line for line in page.read_text().splitlines() if line.startswith("|"))
+    assert "#" not in page.read_text()
+    assert header.startswith("| walker | seeds | cost of transport |")
+    assert three.startswith("| `three` | 3 seeds | 0.200 [0.1")  # that at 0.7 m/s
+    assert three.endswith("| 10.0 % [10.0, 10.0] | 0 of 384 | 100 [100, 100] | 90 [90, 90] | 40 [40, 40] |")
+    assert one == "| `one` | 1 seed | - | 10.0 % | 2 of 64 | - | - | - |"
 
 
 def test_a_bar_is_the_interquartile_mean_and_each_seed_is_a_dot() -> None:
