@@ -7,6 +7,7 @@ from typing import Any, cast
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.projections.polar import PolarAxes
 
@@ -16,7 +17,8 @@ Results = dict[str, Any]
 Group = Sequence[Results]  # of a walker's seeds
 
 COLORS = ("#e8731f", "#29598f", "#3f8f5f", "#8a5aa8", "#c2455a", "#7a6a3a", "#2f9fa8", "#555b66", "#d9b02c", "#7fb3e0")
-GREYS = ("#9aa0a8", "#b6bac0", "#ced1d6")
+GREY = "#b6bac0"  # of the article's own numbers
+SIGNS = ("positive", "negative")  # of work
 STYLE: Any = {
     "font.size": 9,
     "axes.spines.top": False,
@@ -50,9 +52,9 @@ def named(results: Results) -> str:
     return f" {label}" if label.startswith("_") else label
 
 
-def color(index: int, label: str) -> str:
-    """Colour of the method at a position of the whole list, the same in every plot: a grey for the article's own numbers."""
-    return GREYS[index % len(GREYS)] if label.startswith("article") else COLORS[index % len(COLORS)]
+def lighter(tone: str, shade: float) -> tuple[float, ...]:
+    """Return a colour mixed with white, of which there is none where `shade` is 1; grid lines do not shine through."""
+    return tuple(1.0 - shade * (1.0 - part) for part in to_rgb(tone))
 
 
 @rc_context(STYLE)
@@ -66,8 +68,8 @@ def speed(results: Results) -> Figure:
         axes.axhline(float(name), color=COLORS[i % len(COLORS)], lw=0.9, ls=(0, (4, 3)))
     axes.axvspan(0, results["protocol"]["skip_s"], color="#f3f4f6", zorder=0)
     axes.set(xlabel="time [s]", ylabel="speed [m/s]", xlim=(0, series["time_s"][-1]))
-    axes.set_title(f"{named(results)}: speed, and what was commanded (dashed)")
-    axes.legend(ncols=len(commands), loc="lower right")
+    axes.set_title(f"{named(results)}: speed (dashed: commanded; grey: left out of means)")
+    axes.legend(**BESIDE)
     return figure
 
 
@@ -98,50 +100,61 @@ def cost_of_transport(groups: Sequence[Group], commands: Sequence[float] = (0.5,
             if walks_on and row["command_mps"] in commands:
                 cost.setdefault(commands.index(row["command_mps"]), []).append(row["cot_article"])
         costs.append(cost)
-    figure = Figure((7.2 + 0.6 * max(0, sum(map(bool, costs)) - 6), 3.0))
-    axes = figure.subplots()
-    _bars(axes, groups, costs, [f"{command:.1f} m/s" for command in commands], "%.2f")
-    axes.set(ylabel="cost of transport [-]", title="Cost of transport (lower is better)")
-    return figure
+    xlabel, title = "cost of transport, the article's formula [-]", "Cost of transport (lower is better)"
+    return _bars(groups, costs, [f"{command:.1f} m/s" for command in commands], "%.2f", xlabel, title)
 
 
 @rc_context(STYLE)
 def push(groups: Sequence[Group], horizon: str = "10s") -> Figure:
     """Largest push that all worlds survive, by method and direction; the article reports no other."""
-    figure = Figure((7.2 + 0.6 * max(0, len(groups) - 8), 3.0))
-    axes, directions = figure.subplots(), ("forward", "backward", "lateral")
+    directions = ("forward", "backward", "lateral")
     limits = [[limit for results in group if (limit := (results.get("push") or {}).get(horizon))] for group in groups]
     forces = [{at: [limit[f"{name}_n"] for limit in of_it] for at, name in enumerate(directions) if of_it} for of_it in limits]
-    _bars(axes, groups, forces, ["forward", "backward", "lateral (worse side)"], "%.0f")
-    axes.set(ylabel="force for 0.1 s [N]", title=f"Largest push survived during {horizon.removesuffix('s')} s of walking")
-    return figure
+    title = f"Largest push that all worlds survive for {horizon.removesuffix('s')} s"
+    return _bars(groups, forces, ["forward", "backward", "lateral (worse side)"], "%.0f", "force for 0.1 s [N]", title)
 
 
 def _bars(
-    axes: Axes, groups: Sequence[Group], heights: Sequence[Mapping[int, Sequence[float]]], ticks: list[str], digits: str
-) -> None:
-    """Draw a group of bars at every tick: a method's interquartile mean with its interval, and a dot for each seed.
+    groups: Sequence[Group],
+    found: Sequence[Mapping[int, Sequence[float]]],
+    panels: list[str],
+    digits: str,
+    xlabel: str,
+    title: str,
+) -> Figure:
+    """Draw a bar for each method in every panel: its interquartile mean with its interval, and a dot for each seed.
 
-    `heights` holds each method's values by the tick's index; a method without any has no bars.
+    `found` holds each method's values by the panel's index; a method without any is left out.
     """
-    shown = [k for k, height in enumerate(heights) if height]
-    width = 0.84 / max(1, len(shown))
-    for i, k in enumerate(shown):
-        x = [at + (i - 0.5 * (len(shown) - 1)) * width for at in heights[k]]
-        found = [estimate(values) for values in heights[k].values()]
-        tone = color(k, groups[k][0]["label"])
-        axes.bar(x, [one.value for one in found], 0.92 * width, color=tone, label=named(groups[k][0]))
-        for at, one, values in zip(x, found, heights[k].values(), strict=True):
-            place = {"xy": (at, max(values)), "xytext": (0, 2), "textcoords": "offset points"}
-            axes.annotate(digits % one.value, **place, ha="center", fontsize=7)
-            if len(values) > 1:
-                axes.plot([at] * len(values), values, "o", color="black", ms=2.0, alpha=0.6)
-            if np.isfinite(one.low):
-                axes.plot([at, at], [one.low, one.high], color="black", lw=1.2)
-    axes.set_xticks(range(len(ticks)), ticks)
-    axes.grid(axis="x", visible=False)
-    if shown:
-        axes.legend(**BESIDE)
+    shown = [(group, values) for group, values in zip(groups, found, strict=True) if values]
+    figure = Figure((9.6, 1.1 + 0.22 * len(shown)), layout="constrained")
+    figure.suptitle(title, x=0.0, ha="left", fontsize=10, fontweight="bold")
+    figure.supxlabel(xlabel, fontsize=9)
+    for panel, axes in enumerate(figure.subplots(1, len(panels), sharex=True, sharey=True)):
+        for row, (group, values) in enumerate(shown):
+            tone = GREY if group[0]["label"].startswith("article") else COLORS[1]
+            _bar(axes, row, values.get(panel, ()), tone, digits)
+        axes.set_yticks(range(len(shown)), [named(group[0]) for group, _ in shown])
+        axes.set(ylim=(max(1, len(shown)) - 0.5, -0.5))
+        axes.set_title(panels[panel], fontweight="normal")
+        axes.grid(axis="y", visible=False)
+        axes.margins(x=0.15)  # room for the numbers
+    return figure
+
+
+def _bar(axes: Axes, row: int, values: Sequence[float], tone: str, digits: str) -> None:
+    """Draw one method's bar, with its number beside it; a dash where there is none."""
+    one = estimate(values)
+    place = {"xytext": (3, 0), "textcoords": "offset points", "va": "center", "fontsize": 7}
+    if not values:
+        axes.annotate("-", (0.0, row), **place)
+        return
+    axes.barh(row, one.value, 0.8, color=tone)
+    axes.annotate(digits % one.value, (max(values), row), **place)
+    if len(values) > 1:
+        axes.plot(values, [row] * len(values), "o", color="black", ms=2.0, alpha=0.6)
+    if np.isfinite(one.low):
+        axes.plot([one.low, one.high], [row, row], color="black", lw=1.2)
 
 
 @rc_context(STYLE)
@@ -162,6 +175,7 @@ def omni(results: Results) -> Figure:
     polar = cast(PolarAxes, axes["cost"])
     polar.plot([*angle, angle[0]], [*cost, cost[0]], "o-", color=COLORS[0], lw=1.4, ms=4)
     polar.set_theta_zero_location("N")  # forward is up, left is left
+    polar.set_thetagrids((0, 90, 180, 270), ("forward", "left", "backward", "right"))
     polar.set_title(f"cost of transport at {results['omni']['protocol']['direction_speed']:g} m/s", pad=14)
     polar.set_ylim(0.0)
     return figure
@@ -210,7 +224,10 @@ def terrain(results: Results) -> Figure:
     axes.set_yticks(range(len(kinds)), [kind.replace("_", " ") for kind in kinds])
     axes.set(xlim=(-0.5, len(rows) / len(kinds) - 0.5), ylim=(len(kinds) - 0.5, -0.5), xticks=[])
     axes.grid(visible=False)
-    axes.set_title(f"{named(results)}: who leaves the tile on foot, at {results['terrain']['protocol']['command']:g} m/s")
+    speed = f"{results['terrain']['protocol']['command']:g} m/s"
+    axes.set_title(
+        f"{named(results)}: share of the robots that leave their tile on foot, and size of the obstacles, at {speed}"
+    )
     return figure
 
 
@@ -221,7 +238,8 @@ def transfer(results: Results) -> Figure:
     columns = 4
     rows = -(-len(factors) // columns)
     figure = Figure((9.6, 0.9 + 1.5 * rows), layout="constrained")
-    figure.suptitle(f"{named(results)}: one factor at a time at {protocol['command']:g} m/s (dotted: nominal)", fontsize=10)
+    signs = "dotted: nominal; shaded: 95 % interval"
+    figure.suptitle(f"{named(results)}: one factor at a time at {protocol['command']:g} m/s ({signs})", fontsize=10)
     grid = figure.subplots(rows, columns, sharey=True, squeeze=False)
     for axes, factor in zip(grid.flat, factors, strict=False):
         unit, points = factor["unit"], factor["points"]
@@ -231,7 +249,7 @@ def transfer(results: Results) -> Figure:
         axes.fill_between(value, shares[0], shares[1], color=COLORS[1], alpha=0.15, lw=0)
         axes.plot(value, shares[2], "o-", color=COLORS[1], lw=1.3, ms=3, label="share without a fall")
         error = np.array([row["speed_error"] for row in points], dtype=float)
-        axes.plot(value, error, "s--", color=COLORS[0], lw=1.1, ms=2.5, label="speed error, median")
+        axes.plot(value, error, "s--", color=COLORS[0], lw=1.1, ms=2.5, label="median speed error, of the command")
         axes.axvline(scale * factor["nominal"], color="#8b9099", lw=0.9, ls=":")
         shown = "ms" if unit == "physics steps" else unit
         axes.set(ylim=(-0.04, 1.04))
@@ -265,8 +283,8 @@ def joints(results: Results) -> Figure:
         kind = name.removeprefix("right_").removeprefix("left_")
         kinds += [] if kind in kinds else [kind]
         cost = np.array([row["cot_joints"][name] or 0.0 for row in rows])
-        tone, alpha = COLORS[kinds.index(kind) % len(COLORS)], 0.55 if name.startswith("left_") else 1.0
-        axes.barh(range(len(rows)), cost, left=left, color=tone, alpha=alpha, label=name.replace("_", " "))
+        tone = lighter(COLORS[kinds.index(kind) % len(COLORS)], 0.55 if name.startswith("left_") else 1.0)
+        axes.barh(range(len(rows)), cost, left=left, color=tone, label=name.replace("_", " "))
         left += cost
     axes.set_yticks(range(len(rows)), [f"{row['command_mps']:g} m/s" for row in rows])
     axes.invert_yaxis()
@@ -279,15 +297,17 @@ def joints(results: Results) -> Figure:
 @rc_context(STYLE)
 def energy(all_results: Sequence[Results]) -> Figure:
     """Where the energy goes at the speed nearest to 0.7 m/s, by walker: joints and phases, driving right, braking left."""
-    nearest = [
-        (named(results), min(rows, key=lambda row: abs(row["command_mps"] - 0.7)))
-        for results in all_results
-        if (rows := results.get("tracking"))
-    ]
-    figure = _energy_bars(
-        [f"{label}, {row['command_mps']:g} m/s" for label, row in nearest], [row["energy"] for _, row in nearest]
-    )
-    figure.axes[0].set_title("Where the energy goes (right: drives, left: brakes)")
+    labels, shares = [], []
+    for results in all_results:
+        if rows := results.get("tracking"):
+            row = min(rows, key=lambda row: abs(row["command_mps"] - 0.7))
+            total = sum(part[sign] or 0.0 for part in row["energy"] for sign in SIGNS)
+            labels.append(f"{named(results)}, {row['command_mps']:g} m/s, COT {total:.3f}")
+            shares.append(
+                [part | {sign: 100.0 * (part[sign] or 0.0) / (total or 1.0) for sign in SIGNS} for part in row["energy"]]
+            )
+    figure = _energy_bars(labels, shares, "share of the cost of transport [%]")
+    figure.axes[0].set_title("Where the energy goes (left: brakes, right: drives)")
     return figure
 
 
@@ -295,31 +315,33 @@ def energy(all_results: Sequence[Results]) -> Figure:
 def energy_by_speed(results: Results) -> Figure:
     """Where the energy of one walker goes, by speed."""
     rows = results["tracking"]
-    figure = _energy_bars([f"{row['command_mps']:g} m/s" for row in rows], [row["energy"] for row in rows])
-    figure.axes[0].set_title(f"{named(results)}: where the energy goes (right: drives, left: brakes)")
+    labels = [f"{row['command_mps']:g} m/s" for row in rows]
+    figure = _energy_bars(labels, [row["energy"] for row in rows], "part of the cost of transport [-]")
+    figure.axes[0].set_title(f"{named(results)}: where the energy goes (left: brakes, right: drives)")
     return figure
 
 
-def _energy_bars(labels: Sequence[str], rows: Sequence[Sequence[dict[str, Any]]]) -> Figure:
+def _energy_bars(labels: Sequence[str], rows: Sequence[Sequence[dict[str, Any]]], xlabel: str) -> Figure:
     """Draw a bar for each of `rows`: joints by colour, phases by shade, positive work to the right and negative to the left."""
-    figure = Figure((8.6, 1.4 + 0.34 * len(rows)))
+    figure = Figure((8.6, 1.1 + 0.3 * len(rows)))
     axes, shades = figure.subplots(), {"stance": 1.0, "double_support": 0.65, "swing": 0.35}
     parts = list(dict.fromkeys((part["joint"], part["phase"]) for row in rows for part in row))
     joints = list(dict.fromkeys(joint for joint, _ in parts))
-    for sign, way in (("positive", 1.0), ("negative", -1.0)):
+    for sign, way in zip(SIGNS, (1.0, -1.0), strict=True):
         left = np.zeros(len(rows))
         for joint, phase in parts:
             found = [{(part["joint"], part["phase"]): part[sign] or 0.0 for part in row} for row in rows]
             width = way * np.array([part.get((joint, phase), 0.0) for part in found])
             label = f"{joint}, {phase}".replace("_", " ") if sign == "positive" else None
-            tone = COLORS[joints.index(joint) % len(COLORS)]
-            axes.barh(range(len(rows)), width, left=left, color=tone, alpha=shades[phase], label=label)
+            tone = lighter(COLORS[joints.index(joint) % len(COLORS)], shades[phase])
+            axes.barh(range(len(rows)), width, left=left, color=tone, label=label)
             left += width
     axes.axvline(0.0, color="#22262c", lw=0.8)
     axes.set_yticks(range(len(rows)), list(labels))
+    axes.xaxis.set_major_formatter(lambda value, _: f"{abs(value):g}")  # work has no sign here
     axes.invert_yaxis()
     axes.grid(axis="y", visible=False)
-    axes.set(xlabel="share of the cost of transport [-]")
+    axes.set(xlabel=xlabel)
     axes.legend(**BESIDE, fontsize=7)
     return figure
 
@@ -336,9 +358,12 @@ def learning(groups: Sequence[Group]) -> Figure:
             for axes, name in ((left, "episode_length"), (right, "velocity_error_mps")):
                 values = np.array(curve[name], dtype=float)  # None becomes NaN
                 label = named(group[0]) if k == 0 else None
-                axes.plot(samples, values, color=color(i, group[0]["label"]), lw=1.4 / len(curves) ** 0.5, label=label)
-    left.set(xlabel="million samples", ylabel="policy steps", title="Length of training episodes", ylim=(0, None))
-    right.set(xlabel="million samples", ylabel="m/s", title="Velocity error in training", ylim=(0, None))
+                style = {"color": COLORS[i % len(COLORS)], "ls": ("-", "--", ":")[i // len(COLORS) % 3]}
+                axes.plot(samples, values, **style, lw=1.4 / len(curves) ** 0.5, label=label)
+    left.set(xlabel="million samples", ylabel="episode length [policy steps]", title="Length of episodes in training")
+    right.set(xlabel="million samples", ylabel="velocity error [m/s]", title="Velocity error in training")
+    for axes in (left, right):
+        axes.set_ylim(bottom=0.0)
     right.legend(**BESIDE)
     return figure
 

@@ -33,7 +33,7 @@ def write_report(groups: Sequence[Group], out: Path, title: str, text: str = "",
     every = [*groups, *([results] for results in references)]
     filled = [table for table in tables(every) if table[2]]
     markdown = [f"# {title}", *([text] if text else [])]
-    page = [f"<h1>{html.escape(title)}</h1>", *(f"<p>{html.escape(p)}</p>" for p in text.split("\n\n") if p)]
+    page = [f"<h1>{html.escape(title)}</h1>", *(f"<p>{_code(html.escape(p))}</p>" for p in text.split("\n\n") if p)]
     page += [_contents([heading for heading, _, _ in filled])]
     page += [_section(heading, _html(header, rows)) for heading, header, rows in filled]
     page += ["<h2 id='plots'>Comparison in plots</h2>"]
@@ -197,6 +197,11 @@ def _html(header: list[str], rows: list[list[str]]) -> str:
         return "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells) + "</tr>"
 
     return f"<table><thead>{line(header, 'th')}</thead><tbody>{''.join(line(row, 'td') for row in rows)}</tbody></table>"
+
+
+def _code(text: str) -> str:
+    """Return text with what stands between backticks as code."""
+    return re.sub(r"`([^`]+)`", r"<code>\1</code>", text)
 
 
 def _section(heading: str, content: str) -> str:

@@ -71,8 +71,8 @@ def test_the_table_of_the_readme_has_no_heading_and_a_dash_for_what_is_not_measu
 def test_a_bar_is_the_interquartile_mean_and_each_seed_is_a_dot() -> None:
     group = [found(seed, cost) for seed, cost in enumerate((0.1, 0.2, 0.3, 0.4, 0.9), 1)]
     axes = plots.cost_of_transport([group, [found(1, 0.5)]]).axes[0]
-    bars = [patch.get_height() for patch in axes.patches]  # pyright: ignore[reportAttributeAccessIssue]
+    bars = [patch.get_width() for patch in axes.patches]  # pyright: ignore[reportAttributeAccessIssue]
     assert bars == pytest.approx([0.3, 0.5])
     dots, interval = axes.lines  # of the first walker alone
-    assert sorted(dots.get_ydata()) == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.9])  # pyright: ignore[reportArgumentType]
-    assert min(interval.get_ydata()) < 0.3 < max(interval.get_ydata())  # pyright: ignore[reportArgumentType]
+    assert sorted(dots.get_xdata()) == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.9])  # pyright: ignore[reportArgumentType]
+    assert min(interval.get_xdata()) < 0.3 < max(interval.get_xdata())  # pyright: ignore[reportArgumentType]

@@ -190,7 +190,7 @@ def test_a_walk_has_a_step_at_least(candidate: Candidate, robot: Robot) -> None:
 
 
 def test_the_report_shows_the_numbers_beside_the_articles_in_one_file(results: dict[str, Any], tmp_path: Path) -> None:
-    write_report([[results]], tmp_path, "How <it> walks", "First.\n\nSecond.", references())
+    write_report([[results]], tmp_path, "How <it> walks", "First, by `<name>.py`.\n\nSecond.", references())
     markdown, page = ((tmp_path / f"report.{suffix}").read_text() for suffix in ("md", "html"))
     speed = f"{results['tracking'][1]['mean_speed_mps']:.3f}"
     for text in (markdown, page):
@@ -200,7 +200,7 @@ def test_the_report_shows_the_numbers_beside_the_articles_in_one_file(results: d
     assert (
         page.count("<svg") == 9
     )  # cost, energy, omni, terrain, transfer, speed, feet, joints, energy by speed; no push of ten seconds
-    assert "How &lt;it&gt; walks" in page
+    assert "How &lt;it&gt; walks" in page and "<p>First, by <code>&lt;name&gt;.py</code>.</p>" in page
     assert not re.search(r"(src|href)=\"http", page)  # complete in itself
     assert re.findall(r"!\[.*\]\((.*)\)", markdown) == [
         "cost_of_transport.svg",
@@ -215,15 +215,21 @@ def test_the_report_shows_the_numbers_beside_the_articles_in_one_file(results: d
 def test_who_falls_has_no_bar_in_the_cost_of_transport(results: dict[str, Any]) -> None:
     fallen = results | {"label": "falls", "tracking": [row | {"falls": row["worlds"]} for row in results["tracking"]]}
     figure = plots.cost_of_transport([[results], [fallen]])
-    assert figure.axes[0].get_legend_handles_labels()[1] == [results["label"]]
+    assert [text.get_text() for text in figure.axes[0].get_yticklabels()] == [results["label"]]
+
+
+def test_a_walker_s_energy_is_split_into_shares_of_its_own_cost(results: dict[str, Any]) -> None:
+    axes = plots.energy([results, results]).axes[0]
+    cost = results["tracking"][1]["cot_mechanical"]  # at 0.7 m/s
+    assert axes.get_yticklabels()[0].get_text() == f"{results['label']}, 0.7 m/s, COT {cost:.3f}"
+    bars = [patch.get_width() for patch in axes.patches]  # pyright: ignore[reportAttributeAccessIssue]
+    assert sum(map(abs, bars)) == pytest.approx(200.0)  # per cent of two walkers
 
 
 def test_a_label_is_shown_as_it_is_written(results: dict[str, Any]) -> None:
     odd = [results | {"label": label} for label in ("cost $a_$", "_hidden", "$_^{", "5 $")]
     figure = plots.cost_of_transport([[one] for one in odd])
-    legend = figure.axes[0].get_legend()
-    assert legend is not None
-    assert [text.get_text() for text in legend.get_texts()] == [r"cost \$a_\$", " _hidden", r"\$_^{", r"5 \$"]
+    assert [text.get_text() for text in figure.axes[0].get_yticklabels()] == [r"cost \$a_\$", " _hidden", r"\$_^{", r"5 \$"]
     assert plots.svg(figure).startswith("<svg")
     for one in odd:
         for draw in (plots.speed, plots.feet, plots.joints, plots.energy_by_speed):
