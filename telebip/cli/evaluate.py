@@ -43,6 +43,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         from telebip.eval.transfer import TransferProtocol
     suites = check_suites(options.suite.split(","))
     check_overrides(options.overrides, suites)
+    load_task(options.transfer_task)  # refuses a name that is wrong before the long work
     protocol = Protocol(
         worlds=options.num_envs,
         duration=options.duration,
@@ -52,7 +53,10 @@ def main(argv: Sequence[str] | None = None) -> None:
         omni=OmniProtocol(worlds=options.omni_worlds),
         terrain=TerrainProtocol(worlds=options.terrain_worlds),
         transfer=TransferProtocol(
-            worlds=options.transfer_worlds, points=options.transfer_points, sweep_worlds=min(64, options.transfer_worlds)
+            task=options.transfer_task,
+            worlds=options.transfer_worlds,
+            points=options.transfer_points,
+            sweep_worlds=min(64, options.transfer_worlds),
         ),
         device=resolve_device(options.device),
         backend=options.backend,
@@ -61,7 +65,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         candidate = controller_candidate(options.controller, options.label, options.overrides)
     else:
         candidate = checkpoint_candidate(options.checkpoint, options.label, options.overrides, options.allow_robot_change)
-    candidate = replace(candidate, source=" ".join([candidate.source, *options.given]))
+    candidate = replace(candidate, source=" ".join([candidate.source, *map(shlex.quote, options.given)]))
     out = Path(options.out) if options.out else default_folder(candidate.label)
     results = measure(console, candidate, suites, protocol, out)
     title, text = f"{candidate.label}: how it walks", f"Measured by: {candidate.source}"
@@ -218,6 +222,12 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--push-worlds", type=int, default=300, metavar="N", help="worlds at the largest pushes (default: 300)")
     parser.add_argument("--omni-worlds", type=int, default=16, metavar="N", help="worlds for each omni command (default: 16)")
     parser.add_argument("--terrain-worlds", type=int, default=64, metavar="N", help="worlds for each level (default: 64)")
+    parser.add_argument(
+        "--transfer-task",
+        default="telebip_real",
+        metavar="NAME",
+        help="task whose ranges are drawn from (default: telebip_real)",
+    )
     parser.add_argument("--transfer-worlds", type=int, default=512, metavar="N", help="worlds drawn from ranges (default: 512)")
     parser.add_argument(
         "--transfer-points", type=int, default=7, metavar="N", help="values of each factor in sweeps, 0 for none (default: 7)"
@@ -241,7 +251,8 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         f"--{name.replace('_', '-')}={','.join(map(str, value)) if isinstance(value, tuple) else value}"
         for name in (
             *("suite", "num_envs", "duration", "commands", "max_force"),
-            *("push_worlds", "omni_worlds", "terrain_worlds", "transfer_worlds", "transfer_points", "backend"),
+            *("push_worlds", "omni_worlds", "terrain_worlds"),
+            *("transfer_task", "transfer_worlds", "transfer_points", "backend"),
         )
         if (value := getattr(options, name)) != parser.get_default(name)
     ] + ["--allow-robot-change"] * options.allow_robot_change

@@ -47,9 +47,14 @@ def svg(figure: Figure) -> str:
 
 
 def named(results: Results) -> str:
-    """Return the label as matplotlib shows it: `$` opens no formula, and a leading `_` does not hide it from legends."""
-    label = results["label"].replace("$", r"\$")
+    """Return the label as matplotlib shows it: a leading `_` does not hide it from legends."""
+    label = plain(results["label"])
     return f" {label}" if label.startswith("_") else label
+
+
+def plain(text: str) -> str:
+    """Return text in which `$` opens no formula of matplotlib's."""
+    return text.replace("$", r"\$")
 
 
 def lighter(tone: str, shade: float) -> tuple[float, ...]:
@@ -238,8 +243,8 @@ def transfer(results: Results) -> Figure:
     columns = 4
     rows = -(-len(factors) // columns)
     figure = Figure((9.6, 0.9 + 1.5 * rows), layout="constrained")
-    signs = "dotted: nominal; shaded: 95 % interval"
-    figure.suptitle(f"{named(results)}: one factor at a time at {protocol['command']:g} m/s ({signs})", fontsize=10)
+    what = f"one factor of {plain(protocol['task'])} at a time, at {protocol['command']:g} m/s"
+    figure.suptitle(f"{named(results)}: {what} (dotted: nominal; shaded: 95 % interval)", fontsize=10)
     grid = figure.subplots(rows, columns, sharey=True, squeeze=False)
     for axes, factor in zip(grid.flat, factors, strict=False):
         unit, points = factor["unit"], factor["points"]

@@ -32,6 +32,14 @@ def test_evaluate_writes_results_and_reports(tmp_path: Path) -> None:
     assert "mean speed [m/s]" in printed
 
 
+def test_evaluate_draws_robots_from_the_ranges_of_a_task(tmp_path: Path) -> None:
+    transfer = ("--suite", "transfer", "--transfer-task", "telebip_flat", "--transfer-worlds", "2", "--transfer-points", "0")
+    ran(EVALUATE, "--checkpoint", "assets/policies/telebip_efficient", *transfer, "--device", "cpu", "--out", str(tmp_path))
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert "--transfer-task=telebip_flat" in results["source"]
+    assert results["transfer"]["protocol"]["task"] == "telebip_flat"
+
+
 def test_evaluate_measures_a_model_based_walker_at_the_physics_rate(tmp_path: Path) -> None:
     suite, overrides = ("--suite", "tracking", "--commands", "0.5"), ("sim.decimation=1", "control.swing_height=0.05")
     ran(EVALUATE, "--controller", "alip", *suite, *SMALL, "--out", str(tmp_path), *overrides)
@@ -65,6 +73,7 @@ def test_a_report_without_a_folder_stays_in_reports(label: str, folder: str) -> 
         ([EVALUATE, "--controller", "dcm", "episode.length=1"], "use --duration"),
         ([EVALUATE, "--controller", "dcm", "events.push.force=20"], "the push suite has its own pushes"),
         ([EVALUATE, "--controller", "dcm", "events.start_pose.heading=3"], "robots that face x"),
+        ([EVALUATE, "--controller", "dcm", "--transfer-task", "telebip_reel"], "did you mean 'telebip_real'?"),
         ([REPRODUCE, "--only", "telebip_flta"], "did you mean 'telebip_flat'?"),
         ([REPRODUCE, "--seeds", "0"], "--seeds must be 1 or more, got 0"),
         ([REPRODUCE, "--jobs", "0"], "--jobs must be 1 or more, got 0"),
@@ -83,6 +92,7 @@ def test_the_options_that_differ_from_the_defaults_measure_it_again() -> None:
     assert options.given == ["--commands=-0.3,0.5", "--max-force=150.0"]
     again = evaluate._parse(["--controller", "dcm", *options.given])
     assert (again.commands, again.max_force) == ((-0.3, 0.5), 150.0)
+    assert evaluate._parse(["--controller", "dcm", "--transfer-task", "mine.yaml"]).given == ["--transfer-task=mine.yaml"]
 
 
 def test_a_command_with_spaces_and_brackets_can_be_pasted() -> None:

@@ -169,6 +169,20 @@ def test_results_that_lack_something_cannot_be_shown(results: dict[str, Any]) ->
         assert not can_be_shown(results | lacking)
 
 
+def test_robots_are_drawn_from_the_ranges_of_any_task(candidate: Candidate, robot: Robot) -> None:
+    transfer = TransferProtocol(task="telebip_flat", worlds=1, sweep_worlds=1, points=2, duration=0.1, skip=0.0)
+    found = evaluate(candidate, robot, ("transfer",), dataclasses.replace(PROTOCOL, transfer=transfer))["transfer"]
+    assert found["protocol"]["task"] == "telebip_flat"
+    ends = {factor["name"]: [row["value"] for row in factor["points"]] for factor in found["factors"]}
+    events = load_task("telebip_flat").events
+    assert ends == {
+        "push.force": [0.0, events["push"]["force"]],
+        "friction.range": list(events["friction"]["range"]),
+        "observations.noise": [0.0, 1.0],
+    }
+    assert "one factor of telebip_flat at a time" in plots.transfer({"label": "flat", "transfer": found}).get_suptitle()
+
+
 def test_a_controller_is_told_by_its_parameters() -> None:
     own, same, other = (controller_candidate("dcm", None, overrides) for overrides in ((), (), ("control.step_time=0.3",)))
     assert own.fingerprint == same.fingerprint != other.fingerprint
