@@ -30,6 +30,12 @@ def on_flat_ground(config: TaskConfig) -> TaskConfig:
     return replace(config, terrain=replace(config.terrain, types={}))
 
 
+def on_levels(config: TaskConfig, first: int, last: int) -> TaskConfig:
+    """Return a task whose worlds start on these levels of its terrain, and keep their tiles."""
+    events = {name: params for name, params in config.events.items() if params.get("term", name) != "terrain_level"}
+    return replace(config, terrain=replace(config.terrain, start_level=(first, last)), events=events)
+
+
 def as_evaluated(
     config: TaskConfig, num_envs: int, duration: float, overrides: Sequence[str] = (), disturbed: bool = False
 ) -> TaskConfig:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from telebip.config import TaskConfig, check
 from telebip.control.policy import Policy
 from telebip.env import TelebipEnv
+from telebip.eval.conditions import on_levels
 from telebip.eval.statistics import share_interval
 from telebip.rollout import judge_faults, walk
 
@@ -54,13 +55,14 @@ class TerrainProtocol:
 
 def on_test_ground(config: TaskConfig) -> TaskConfig:
     """Return a task of `as_evaluated` on the grounds of this suite, its robots facing anywhere; worlds keep their tiles."""
-    terrain = replace(config.terrain, types=TYPES, levels=LEVELS, start_level=(0, LEVELS - 1), size=SIZE, platform=1.0, seed=1)
-    events = {name: params for name, params in config.events.items() if params.get("term", name) != "terrain_level"}
+    terrain = replace(config.terrain, types=TYPES, levels=LEVELS, size=SIZE, platform=1.0, seed=1)
+    config = on_levels(replace(config, terrain=terrain), 0, LEVELS - 1)
+    events = dict(config.events)
     if "start_pose" in events:
         events["start_pose"] = {**events["start_pose"], "heading": math.pi}
     contacts, constraints = max(16, config.sim.max_contacts), max(96, config.sim.max_constraints)
     sim = replace(config.sim, max_contacts=contacts, max_constraints=constraints)
-    return check(replace(config, terrain=terrain, events=events, sim=sim))
+    return check(replace(config, events=events, sim=sim))
 
 
 def terrain_results(

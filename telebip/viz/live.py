@@ -11,12 +11,12 @@ import rerun as rr
 import torch
 
 from telebip.env import TelebipEnv
-from telebip.eval.conditions import as_evaluated
+from telebip.eval.conditions import as_evaluated, on_levels
 from telebip.rl.policy import load_policy
 from telebip.rl.train import Trainer
 from telebip.rollout import roll_out
 from telebip.viz.blueprint import training_layout
-from telebip.viz.rerun import log_mesh, viewer
+from telebip.viz.rerun import ground_mesh, log_mesh, viewer
 from telebip.viz.scene import LANE
 from telebip.viz.urdf import Array, link_poses, load_urdf
 
@@ -49,19 +49,23 @@ class LiveView:
     """Streams curves after every iteration, and now and then a new walk, which a thread of its own plays over and over.
 
     The robots live in worlds of their own on the CPU, with the task's commands and disturbances, and walk anew whenever curves,
-    walks and frames so far have taken less than their share of the time.
+    walks and frames so far have taken less than their share of the time. On a terrain they have tiles of its middle level, and
+    each lane shows a strip of one.
     """
 
     def __init__(self, trainer: Trainer, stream: rr.RecordingStream, budget: float = BUDGET) -> None:
-        """Log the robots' shapes and start the thread; `budget` is the share of the time that may be taken."""
+        """Log robots' shapes and ground, and start the thread; `budget` is the share of the time that may be taken."""
         self._trainer, self._stream, self._budget = trainer, stream, budget
         self._start, self._spent, self._played = time.perf_counter(), 0.0, 0.0  # [s], the last two by either thread
         cfg, robot = as_evaluated(trainer.env.cfg, WORLDS, SECONDS, disturbed=True), trainer.env.robot
+        cfg = on_levels(cfg, cfg.terrain.levels // 2, cfg.terrain.levels // 2)
         self._env = TelebipEnv(replace(cfg, observations={"policy": cfg.observations["policy"]}), robot, "cpu", "native")
+        self._shift = _lanes(self._env)
         self._urdf = load_urdf(robot)
         stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         for link in self._urdf.link_map:
             log_mesh(stream, f"world/{link}", self._urdf, link, robot)
+        _log_ground(stream, self._env, self._shift)
         self._frames: list[dict[str, list[rr.DescribedComponentBatch]]] = []  # for each frame, poses of each link
         self._closing = threading.Event()
         self._player = threading.Thread(target=self._play, daemon=True)
@@ -90,7 +94,7 @@ class LiveView:
             policy = load_policy(trainer.policy(), "cpu")
         rollout = roll_out(env, policy, round(SECONDS / env.step_dt))
         qpos = rollout.qpos[::FRAME_STEPS].astype(float)
-        qpos[..., 1] += LANE * (0.5 * (WORLDS - 1) - np.arange(WORLDS))
+        qpos[..., :3] += self._shift
         poses = link_poses(self._urdf, env.robot, qpos.reshape(-1, qpos.shape[-1]))
         frames = {link: pose.reshape(len(qpos), WORLDS, 4, 4) for link, pose in poses.items()}
         self._frames = [{link: _poses(pose[i]) for link, pose in frames.items()} for i in range(len(qpos))]
@@ -113,6 +117,23 @@ class LiveView:
         """Set the calling thread's time: samples, which the viewer follows, and seconds, which can be played again."""
         self._stream.set_time("samples", sequence=self._trainer.samples)
         self._stream.set_time("time", duration=time.perf_counter() - self._start)
+
+
+def _lanes(env: TelebipEnv) -> Array:
+    """Return by how much each world is moved [m], (WORLDS, 3), so that all start side by side."""
+    shift = np.zeros((WORLDS, 3))
+    shift[:, 1] = LANE * (0.5 * (WORLDS - 1) - np.arange(WORLDS))
+    ground = env.world.ground
+    return shift - ground.origin(env.state.tile).numpy() if ground else shift
+
+
+def _log_ground(stream: rr.RecordingStream, env: TelebipEnv, shift: Array) -> None:
+    """Log the strip of each world's tile that its lane has room for, if there is a terrain."""
+    if terrain := env.robot.terrain:
+        for world, origin in enumerate(env.world.ground.origin(env.state.tile).numpy()):
+            reach = 0.5 * np.array([terrain.size, LANE])
+            strip = ground_mesh(terrain, origin[:2] - reach, origin[:2] + reach)
+            stream.log(f"world/ground/{world}", strip, rr.Transform3D(translation=shift[world]), static=True)
 
 
 def _poses(pose: Array) -> list[rr.DescribedComponentBatch]:

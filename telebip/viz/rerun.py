@@ -18,6 +18,7 @@ from rerun.blueprint import Blueprint
 from telebip.errors import UserError
 from telebip.math import yaw
 from telebip.robot import FEET, FOOT_SENSORS, Robot
+from telebip.terrain import Terrain
 from telebip.viz.blueprint import walk_layout
 from telebip.viz.opengl import has_display
 from telebip.viz.scene import ACTUAL, COMMAND, FORCE_SCALE, GROUND_FORCE, PUSH, PUSH_SCALE, SPEED_SCALE, Actor, Color
@@ -147,11 +148,14 @@ def log_walks(stream: rr.RecordingStream, actors: Sequence[Actor], robot: Robot,
 
 def _log_ground(stream: rr.RecordingStream, robot: Robot, path: str, actor: Actor, margin: float = 1.5) -> None:
     """Log the terrain, if there is one, up to `margin` [m] beside the robot's way."""
-    terrain, way = robot.terrain, actor.rollout.qpos[:, actor.world, :2].astype(float)
-    if terrain is None:
-        return
+    way = actor.rollout.qpos[:, actor.world, :2].astype(float)
+    if robot.terrain:
+        stream.log(path, ground_mesh(robot.terrain, way.min(0) - margin, way.max(0) + margin), static=True)
+
+
+def ground_mesh(terrain: Terrain, low: Array, high: Array) -> rr.Mesh3D:
+    """Return the terrain from one corner to the opposite one, (x, y) each [m], the brighter the higher."""
     rows, columns = terrain.heights.shape
-    low, high = way.min(0) - margin, way.max(0) + margin
     (left, right), (near, far) = (
         np.clip(((np.array(ends) + half) / terrain.resolution).round().astype(int), 0, count - 1)
         for ends, half, count in zip(zip(low, high, strict=True), terrain.half_extent, (columns, rows), strict=True)
@@ -163,9 +167,7 @@ def _log_ground(stream: rr.RecordingStream, robot: Robot, path: str, actor: Acto
     faces = np.concatenate([corner[:, None] + [0, 1, len(x) + 1], corner[:, None] + [0, len(x) + 1, len(x)]])
     shade = (150 + 60 * (points[..., 2:] - points[..., 2].min()) / max(float(np.ptp(points[..., 2])), 0.1)).astype(np.uint8)
     colors = np.repeat(shade, 3, axis=-1).reshape(-1, 3)
-    stream.log(
-        path, rr.Mesh3D(vertex_positions=points.reshape(-1, 3), triangle_indices=faces, vertex_colors=colors), static=True
-    )
+    return rr.Mesh3D(vertex_positions=points.reshape(-1, 3), triangle_indices=faces, vertex_colors=colors)
 
 
 def names(actors: Sequence[Actor]) -> list[str]:
