@@ -73,7 +73,6 @@ class Policy:
     def start(self, readings: Readings) -> None:
         """Begin to walk: forget the past and take the present heading as reference."""
         self._steps = 0
-        self._clock = 0.0  # of the gait [s]
         self._last_action = np.zeros(len(self._nominal))
         self._reference_heading = yaw(readings.quat)
         self._lag = np.zeros(2)  # how far the robot is behind the commanded velocity, forward and to the left [m]
@@ -87,8 +86,6 @@ class Policy:
             command: (vx forward, vy left, yaw rate) [m/s, m/s, rad/s].
         """
         if self._steps > 0:
-            stride = self.about["gait_period"] * np.hypot(*command[:2])
-            self._clock += self.about["step_dt"] * max(1.0, stride / self.about["gait_max_stride"])
             self._reference_heading += self.about["step_dt"] * command[2]
             self._advance_lag(readings, command)
         seen, history = self._seen(readings, command), self.about["history"]
@@ -111,7 +108,7 @@ class Policy:
         about = self.about
         error = (self._reference_heading - yaw(readings.quat) + np.pi) % (2.0 * np.pi) - np.pi
         correction = np.clip(about["heading_gain"] * error, -about["heading_limit"], about["heading_limit"])
-        phase = np.sin(2.0 * np.pi * self._clock / about["gait_period"])
+        phase = np.sin(2.0 * np.pi * self._steps * about["step_dt"] / about["gait_period"])
         return {
             "joint_pos": readings.joint_pos - self._nominal,
             "joint_vel": readings.joint_vel,

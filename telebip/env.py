@@ -17,7 +17,6 @@ from telebip.mdp.actions import DelayLine, joint_targets, scales
 from telebip.mdp.binding import Binder, Events, model_fields_of, sensors_of
 from telebip.mdp.commands import VelocityCommands
 from telebip.mdp.faults import FaultRecorder
-from telebip.mdp.gait import clock_rate
 from telebip.mdp.ground import Ground
 from telebip.mdp.groups import Group
 from telebip.mdp.step import EnvState, Step, World
@@ -120,7 +119,6 @@ class TelebipEnv(VecEnv):
             decimation=cfg.sim.decimation,
             episode_length=cfg.episode.length,
             gait_period=cfg.gait.period,
-            gait_max_stride=cfg.gait.max_stride,
             home_qpos=constant(robot.home_qpos),
             nominal=constant(robot.nominal),
             force_range=constant(robot.force_range),
@@ -253,8 +251,6 @@ class TelebipEnv(VecEnv):
         state.episode_length += 1
         state.has_begun.fill_(True)
         state.command_timer -= self.step_dt
-        rate = clock_rate(state.target_command, self.world.gait_period, self.world.gait_max_stride)
-        state.gait_lead += self.step_dt * (rate - 1.0)
         step = self.view()
         self._commands.advance(step)
 

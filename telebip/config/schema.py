@@ -41,11 +41,6 @@ class GaitConfig:
     """The clock of the phase signals."""
 
     period: Annotated[float, Quantity("s", gt=0, le=60)]
-    max_stride: Annotated[float, Quantity("m", gt=0)]
-
-    def period_at(self, speed: float) -> float:
-        """Return the period at a commanded speed [m/s] in s, see `telebip.mdp.gait.clock_rate`."""
-        return min(self.period, self.max_stride / max(abs(speed), 1e-9))
 
 
 @dataclass(frozen=True)

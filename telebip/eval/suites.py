@@ -107,7 +107,7 @@ def evaluate(
         if "tracking" in suites:
             results["tracking"] = [_tracking_row(command, walk, protocol.skip) for command, walk in walks.items()]
         if "gait" in suites:
-            results["gait"] = _gait(walks[command], robot, command, protocol.skip, candidate.task.gait.period_at(command))
+            results["gait"] = _gait(walks[command], robot, command, protocol.skip, candidate.task.gait.period)
     if "push" in suites:
         results["push"] = _push(candidate, robot, protocol, progress)
     if "terrain" in suites:

@@ -5,26 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from telebip.math import columns, norm
-
-
-def clock_rate(command: Tensor, period: float, max_stride: float) -> Tensor:
-    r"""How fast the gait clock runs, so that no stride is longer than a leg likes to make it.
-
-        T(v) = min(T, L / ||v_xy_cmd||),    rate = T / T(v) = max(1, T ||v_xy_cmd|| / L)
-
-    Not in the article, whose period is the same at all speeds. Slow steps waste little energy at low speeds, and need strides
-    that are too long at high ones: see the cheapest times of a step in docs/evaluation.md.
-
-    Args:
-        command: commanded (vx, vy, ...) without the holds' corrections [m/s], (num_envs, 2 or more).
-        period: T, the longest period [s].
-        max_stride: L, the longest stride, of two steps [m].
-
-    Returns:
-        Seconds of the clock per second [-], (num_envs,).
-    """
-    return (period / max_stride * norm(command[:, :2])).clamp(min=1.0)
+from telebip.math import columns
 
 
 def phase_signals(time: Tensor, period: float) -> Tensor:
@@ -33,7 +14,7 @@ def phase_signals(time: Tensor, period: float) -> Tensor:
         p_r(t) = sin(2 pi t / T),    p_l(t) = sin(2 pi t / T + pi) = -p_r(t)                  (article, phase signals)
 
     Args:
-        time: time of the gait clock since the start of the episode [s], (num_envs,).
+        time: time since the start of the episode [s], (num_envs,).
         period: T [s].
 
     Returns:

@@ -30,8 +30,7 @@ class World:
     step_dt: float  # policy step [s]
     decimation: int  # physics steps per policy step
     episode_length: float  # until the time-out [s]
-    gait_period: float  # T, the longest [s]
-    gait_max_stride: float  # see `telebip.mdp.gait.clock_rate` [m]
+    gait_period: float  # T [s]
     home_qpos: Tensor  # (nq,)
     nominal: Tensor  # joint positions of the home pose [rad | m], (num_joints,)
     force_range: Tensor  # of the actuators, negative and positive [N m | N], (num_joints, 2)
@@ -52,7 +51,7 @@ class World:
 
     @property
     def gait_steps(self) -> int:
-        """Policy steps in the longest gait period, rounded."""
+        """Policy steps in one gait period, rounded."""
         return round(self.gait_period / self.step_dt)
 
     def zeros(self, *size: int) -> Tensor:
@@ -70,7 +69,6 @@ class EnvState:
     """All that the worlds' future depends on, beside the engine's own state and the generator. Tensors, written in place."""
 
     episode_length: Tensor  # policy steps since reset, or what a learner has assigned, (num_envs,) long
-    gait_lead: Tensor  # by how much the gait clock is ahead of the time [s], (num_envs,)
     has_begun: Tensor  # whether a step has been made since reset, (num_envs,) bool
     last_action: Tensor  # A_{t-1} [-], (num_envs, num_joints)
     command_timer: Tensor  # time until the next command [s], (num_envs,)
@@ -93,7 +91,6 @@ class EnvState:
         device = world.device
         return EnvState(
             episode_length=torch.zeros(world.num_envs, dtype=torch.long, device=device),
-            gait_lead=world.zeros(),
             has_begun=torch.zeros(world.num_envs, dtype=torch.bool, device=device),
             last_action=world.zeros(world.num_joints),
             command_timer=world.zeros(),
@@ -186,7 +183,7 @@ class Step:
     @cached_property
     def phase(self) -> Tensor:
         """Phase signals (p_r, p_l) [-], (num_envs, 2)."""
-        return phase_signals(self.time + self.env.gait_lead, self.world.gait_period)
+        return phase_signals(self.time, self.world.gait_period)
 
     @cached_property
     def base_height(self) -> Tensor:

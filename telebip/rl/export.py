@@ -117,7 +117,6 @@ def describe(checkpoint: Checkpoint, robot: Robot) -> dict[str, Any]:
         "physics_dt": robot.physics_dt,  # s
         "step_dt": robot.physics_dt * config.sim.decimation,  # s
         "gait_period": config.gait.period,  # s
-        "gait_max_stride": config.gait.max_stride,  # m
         "command_range": {name: list(getattr(config.commands, name)) for name in ("lin_vel_x", "lin_vel_y", "ang_vel_z")},
         "heading_gain": config.commands.heading_gain,  # 1/s
         "heading_limit": config.commands.heading_limit,  # rad/s

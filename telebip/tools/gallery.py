@@ -50,7 +50,7 @@ class Gallery:
 
     def walking(self, file: Path) -> None:
         """Eight strides as a GIF."""
-        seconds = 8 * self.checkpoint.config.gait.period_at(self.command[0])
+        seconds = 8 * self.checkpoint.config.gait.period
         film(self.actors, self.robot, file, size=(560, 315), start=self.rollout.time[-1] - seconds)
 
     def strides(self, file: Path) -> None:

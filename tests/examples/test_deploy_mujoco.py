@@ -27,7 +27,6 @@ from telebip.rl.train import Trainer
 from telebip.robot import Robot, load_robot
 
 EXAMPLE = ROOT / "examples" / "deploy_mujoco.py"
-CLOCK = ("gait.max_stride=0.2",)  # m; at 0.5 m/s a period of 0.4 s
 STILL = ("events.start_pose.joint_pos=0", "events.start_velocity=null")
 
 
@@ -48,7 +47,7 @@ def untrained(tmp_path: Path) -> Callable[[str, dict, int], Path]:
     """Return a function that exports a policy with random weights for a robot of the tests."""
 
     def make(name: str, terms: dict, history: int = 1) -> Path:
-        task = load_task(str(ROOT / "tests" / "robots" / f"{name}.yaml"), ["num_envs=4", *CLOCK, "commands.velocity_gain=0.5"])
+        task = load_task(str(ROOT / "tests" / "robots" / f"{name}.yaml"), ["num_envs=4", "commands.velocity_gain=0.5"])
         task = replace(task, observations={"policy": ObservationGroup(terms, history)})
         export(Trainer(telebip.make(task), name, tmp_path).policy(), tmp_path / "policy.onnx", samples=100)
         return tmp_path / "policy.onnx"

@@ -43,7 +43,6 @@ def make_world(robot: Robot, num_envs: int = 1, gait_period: float = 0.5, fields
         decimation=4,
         episode_length=10.0,
         gait_period=gait_period,
-        gait_max_stride=100.0,
         home_qpos=torch.as_tensor(robot.home_qpos).float(),
         nominal=torch.as_tensor(robot.nominal).float(),
         force_range=torch.as_tensor(robot.force_range).float(),

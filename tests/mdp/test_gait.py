@@ -8,10 +8,8 @@ import pytest
 import torch
 from steps import make_world
 from torch import Tensor
-from worlds import NEVER_FALL, PHASE, MakeEnv
 
-from telebip.config import load_task
-from telebip.mdp.gait import clock_rate, phase_signals, window_weights
+from telebip.mdp.gait import phase_signals, window_weights
 from telebip.mdp.rewards import foot
 from telebip.mdp.term import find
 from telebip.robot import Robot
@@ -56,31 +54,6 @@ def test_half_a_period_later_the_feet_have_changed_roles() -> None:
     torch.testing.assert_close(
         phase_signals(time + PERIOD / 2, PERIOD), phase_signals(time, PERIOD).flip(1), atol=1e-5, rtol=0.0
     )
-
-
-@pytest.mark.parametrize(
-    ("command", "period"),
-    [((0.0, 0.0), 0.8), ((0.5, 0.0), 0.8), ((1.0, 0.0), 0.55), ((-1.1, 0.0), 0.5), ((0.6, -0.8), 0.55)],
-)
-def test_the_clock_runs_faster_where_a_stride_would_be_too_long(command: tuple[float, float], period: float) -> None:
-    rate = clock_rate(torch.tensor([[*command, 0.7]]), 0.8, 0.55)
-    torch.testing.assert_close(0.8 / rate, torch.tensor([period]))
-    gait = load_task("telebip_flat", ["gait.period=0.8", "gait.max_stride=0.55"]).gait
-    assert gait.period_at(math.hypot(*command)) == pytest.approx(period)
-
-
-def test_each_world_has_its_own_period_and_no_jump_of_the_phase(make_env: MakeEnv) -> None:
-    env = make_env("gait.period=0.8", "gait.max_stride=0.4", NEVER_FALL, calm=True, num_envs=2)
-    clock = torch.zeros(2)
-    for speeds in (torch.tensor([0.25, 1.0]), torch.tensor([1.0, 0.8])):  # m/s; periods 0.8 and 0.4, then 0.4 and 0.5
-        env.set_commands(torch.stack([speeds, 0.0 * speeds, 0.0 * speeds], dim=1))
-        for _ in range(10):
-            obs, *_ = env.step(torch.zeros(2, env.num_actions))
-            clock += env.step_dt * (speeds / 0.4).clamp(min=1.0 / 0.8)
-            expected = torch.sin(2.0 * math.pi * clock)
-            torch.testing.assert_close(obs["policy"][:, PHASE], torch.stack([expected, -expected], dim=1), atol=1e-5, rtol=0.0)
-    env.reset()
-    assert torch.equal(env.view().phase, torch.zeros(2, 2))
 
 
 @pytest.mark.parametrize(("period", "samples"), [(0.5, 26), (0.6, 31)])

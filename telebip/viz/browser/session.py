@@ -297,6 +297,6 @@ def _numbers(recent: Rollout, steering: Steering, rate: float) -> str:
         "| | forward | left | turn |\n|---|---|---|---|\n"
         f"| wanted | {wanted[0]:.2f} m/s | {wanted[1]:.2f} m/s | {wanted[2]:+.2f} rad/s |\n"
         f"| last second | {vx:.2f} m/s | {vy:.2f} m/s | {turn:+.2f} rad/s |\n\n"
-        f"cost of transport **{cost:.2f}** · gait period {steering.env.cfg.gait.period_at(np.hypot(*wanted[:2])):.2g} s · "
+        f"cost of transport **{cost:.2f}** · gait period {steering.env.cfg.gait.period:g} s · "
         f"falls {steering.falls} · {state}"
     )
