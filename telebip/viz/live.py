@@ -129,8 +129,9 @@ def _lanes(env: TelebipEnv) -> Array:
 
 def _log_ground(stream: rr.RecordingStream, env: TelebipEnv, shift: Array) -> None:
     """Log the strip of each world's tile that its lane has room for, if there is a terrain."""
-    if terrain := env.robot.terrain:
-        for world, origin in enumerate(env.world.ground.origin(env.state.tile).numpy()):
+    terrain, ground = env.robot.terrain, env.world.ground
+    if terrain and ground:
+        for world, origin in enumerate(ground.origin(env.state.tile).numpy()):
             reach = 0.5 * np.array([terrain.size, LANE])
             strip = ground_mesh(terrain, origin[:2] - reach, origin[:2] + reach)
             stream.log(f"world/ground/{world}", strip, rr.Transform3D(translation=shift[world]), static=True)
