@@ -1,12 +1,14 @@
-"""What the commands share: one-line errors, devices."""
+"""What the commands share: one-line errors, devices, Ctrl-C."""
 
 import argparse
 import os
 import re
 import shlex
 import shutil
+import signal
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -259,3 +261,29 @@ def resolve_device(name: str) -> "torch.device":
     if device.type == "cuda":
         torch.cuda.set_device(device)
     return device
+
+
+@contextmanager
+def stop_on_signal(console):
+    """Yield a function that tells whether to stop: one Ctrl-C ends the run after its iteration, a second one at once.
+
+    So do SIGTERM and, as a terminal that is closed sends it, SIGHUP; not where `nohup` has said to ignore that.
+    """
+    asked = False
+
+    def handle(signum: int, frame: object) -> None:
+        nonlocal asked
+        if asked:
+            raise KeyboardInterrupt
+        asked = True
+        console.print("stopping after this iteration with a checkpoint (press Ctrl-C again to leave at once)")
+
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
+        numbers.append(signal.SIGHUP)
+    previous = {number: signal.signal(number, handle) for number in numbers}
+    try:
+        yield lambda: asked
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)

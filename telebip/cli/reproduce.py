@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from telebip import ROOT
-from telebip.cli.common import Parser, resolve_device
+from telebip.cli.common import Parser, resolve_device, stop_on_signal
 from telebip.cli.evaluate import checkpoint_candidate, controller_candidate, measure, references
 from telebip.cli.trainings import Run, default_jobs, train_all
 from telebip.config import load_task
@@ -46,7 +46,6 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Parse arguments, train, measure, ship and report."""
     options = _parse(argv)
     from telebip.cli.console import Console
-    from telebip.cli.train import stop_on_signal
 
     console = Console()
     with console.status("loading torch and the physics engine"):

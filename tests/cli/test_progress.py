@@ -5,7 +5,7 @@ import io
 import pytest
 from rich.console import Console
 
-from telebip.cli.train import progress_bar, sparkline
+from telebip.cli.progress import sparkline, training_progress
 from telebip.config import load_task
 from telebip.env import TelebipEnv
 from telebip.rl.train import Trainer
@@ -19,7 +19,7 @@ def test_the_progress_is_whole_on_a_terminal(robot: Robot, tmp_path, width: int)
     trainer = Trainer(TelebipEnv(load_task("telebip_flat", SMALL), robot, "cpu", "native"), "telebip_flat", tmp_path)
     screen = io.StringIO()
     console = Console(file=screen, force_terminal=True, width=width, highlight=False, color_system=None)
-    with progress_bar(console, trainer) as show:
+    with training_progress(console, trainer) as show:
         scalars = trainer.iterate()
         show(scalars)
     text = screen.getvalue()
