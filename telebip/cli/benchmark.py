@@ -64,7 +64,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         Path(options.json).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
         console.print(f"wrote {options.json}")
     if options.plot:
-        from telebip.eval.plots import throughput
+        from telebip.tools.plots import throughput
 
         throughput(rows, f"{task} on {machine}").savefig(options.plot, dpi=150, bbox_inches="tight")
         console.print(f"wrote {options.plot}")

@@ -28,9 +28,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         import torch
 
         from telebip.cli.evaluate import progress_bar
-        from telebip.eval import plots
         from telebip.rl.process import keep_freed_memory
         from telebip.rl.run import describe_code, machine_name
+        from telebip.tools import plots
         from telebip.tools.race import RACERS, race, sentence, verdict
 
     first = load_task(options.task, options.overrides)
