@@ -209,7 +209,7 @@ def test_number_is_a_number_however_it_is_written(text: str) -> None:
         ("actions.scale.ankle=null", ["actions.scale.ankle: None is not a number"]),
         ("rewards=1", ["rewards is a section; name its entries"]),
         ("rewards.fot.cap=1", ["rewards.fot: unknown reward 'fot'; did you mean 'foot'?"]),
-        ("rewards.zzz={}", ["rewards.zzz: unknown reward 'zzz'; valid: cmd, diff, "]),
+        ("rewards.zzz={}", ["rewards.zzz: unknown reward 'zzz'; valid: cmd, cot, "]),
         ("rewards.soft.term=fot", ["rewards.soft: unknown reward 'fot'; did you mean 'foot'?"]),
         ("rewards.soft.term=3", ["rewards.soft.term: 3 is not a text"]),
         ("rewards.soft={term: foot, cap: 1}", ["field 'rewards.soft.k_foot' has no value"]),
