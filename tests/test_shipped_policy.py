@@ -42,9 +42,10 @@ OTHERS = {
     "telebip_rough": (0.7, 0.672),
     "telebip_stairs": (0.7, 0.718),
     "telebip_real": (0.7, 0.712),
+    "telebip_omni": (0.7, 0.703),
 }
 """Commanded and published mean speed [m/s]."""
-SLOW = ("telebip_efficient", "period_06", "telebip_rough", "telebip_stairs", "telebip_real")
+SLOW = ("telebip_efficient", "period_06", "telebip_rough", "telebip_stairs", "telebip_real", "telebip_omni")
 """Those with a gait period of 0.6 s; the others have 0.5 s."""
 
 
