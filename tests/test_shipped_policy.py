@@ -47,7 +47,7 @@ OTHERS = {
 """Commanded and published mean speed [m/s]."""
 SLOW = ("telebip_efficient", "period_06", "telebip_rough", "telebip_stairs", "telebip_real")
 PERIODS = {**dict.fromkeys(SLOW, 0.6), "telebip_omni": 0.24}
-"""Periods of their gaits where they are not 0.5 s [s]; `telebip_omni` steps faster than its clock, see docs/omnidirectional.md."""
+"""Periods of the gaits where they are not 0.5 s [s]; `telebip_omni` steps faster than its clock (docs/omnidirectional.md)."""
 
 
 def walk(
